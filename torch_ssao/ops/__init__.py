@@ -1,0 +1,10 @@
+"""Functions on tensors: one technique or one primitive a file."""
+
+from torch_ssao.ops.falloff import contrast_power as contrast_power
+from torch_ssao.ops.falloff import psi as psi
+from torch_ssao.ops.normals import normals_from_points as normals_from_points
+from torch_ssao.ops.partition import adaptive_labels as adaptive_labels
+from torch_ssao.ops.sat import Window as Window
+from torch_ssao.ops.sat import box_sum as box_sum
+from torch_ssao.ops.sat import summed_area_table as summed_area_table
+from torch_ssao.ops.statvo import statvo_obscurance as statvo_obscurance
