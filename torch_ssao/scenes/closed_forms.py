@@ -110,7 +110,7 @@ def half_space(
         return _cap(np.minimum(d / np.maximum(reach, _TINY), 1.0), tilt, kernel)
 
     # The cap is born at t = d / R and meets the horizon at t = d / (R sin tilt).
-    breaks = (d / radius, d / np.maximum(radius * sin_tilt, _TINY))
+    breaks = (d / radius, d / radius / np.maximum(sin_tilt, 1e-30))
     return 1.0 - _attenuated(binary, radius, exponent, breaks)
 
 

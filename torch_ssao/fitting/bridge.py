@@ -1,0 +1,131 @@
+"""The bridge to optimistix: Levenberg-Marquardt in jax on residuals that torch evaluates. The one file with both.
+
+jax is imported on first use, works on the CPU only and in float64. Importing this file loads neither jax nor optimistix.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_ssao import checks
+
+Array = NDArray[np.float64]
+Evaluate = Callable[[Array], tuple[Array, Array]]
+
+MAX_STEPS = 256  # the budget of evaluations ends a solve long before
+TOLERANCE = 1e-6  # in u and in the scaled residuals: far below what a fit can tell apart
+
+_LOCK = threading.Lock()  # jax's float64 flag is global, and so is the evaluation that the compiled solver visits
+_ACTIVE: list[_Visit] = []
+
+
+class StopSolver(Exception):
+    """Raised by an evaluation to end the solve early."""
+
+
+def check_installed() -> None:
+    """Raise `MissingExtraError` unless optimistix can be imported."""
+    if importlib.util.find_spec("optimistix") is None:
+        raise checks.MissingExtraError("fit needs optimistix, which is not installed: run pip install torch_ssao[fitting]")
+
+
+def levenberg_marquardt(evaluate: Evaluate, start: Array) -> bool:
+    """Minimise |r(u)|^2 from `start`.
+
+    Args:
+        evaluate: u (P,) -> residuals (P + 1,) and Jacobian (P + 1, P), float64; what it raises ends the solve.
+            Only the Jacobian at points that lower |r| is used.
+        start: (P,) float64.
+    Returns: whether the tolerances were met; False when `evaluate` raised `StopSolver` or the steps ran out. The caller keeps the
+        best point that `evaluate` saw.
+    Raises: whatever else `evaluate` raised, from here and not from inside jax.
+    Cost: one visit to `evaluate` a step; the solver is compiled once (about a second) for each P.
+    """
+    with _LOCK, _float64_on_cpu():
+        visit = _Visit(evaluate)
+        _ACTIVE.append(visit)
+        try:
+            converged = bool(_solver(len(start))(start))
+        finally:
+            _ACTIVE.pop()
+    if visit.error is not None and not isinstance(visit.error, StopSolver):
+        raise visit.error
+    return converged and visit.error is None
+
+
+class _Visit:
+    """One solve's evaluations; the first exception is kept, because jax would wrap it in one of its own."""
+
+    def __init__(self, evaluate: Evaluate) -> None:
+        self.evaluate = evaluate
+        self.error: BaseException | None = None
+
+    def __call__(self, u: Any) -> tuple[Array, Array]:
+        u = np.array(u, dtype=np.float64)
+        if self.error is None:
+            try:
+                residual, jacobian = self.evaluate(u)
+                return np.asarray(residual, np.float64), np.asarray(jacobian, np.float64)
+            except BaseException as error:  # KeyboardInterrupt too must leave jax in order
+                self.error = error
+        return np.full(len(u) + 1, np.nan), np.full((len(u) + 1, len(u)), np.nan)
+
+
+@contextmanager
+def _float64_on_cpu() -> Iterator[None]:
+    """Import jax so that it leaves the GPU alone, and switch it to float64 while the context lasts."""
+    if "jax" not in sys.modules:
+        os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    import jax
+
+    before = jax.config.jax_enable_x64
+    jax.config.update("jax_enable_x64", True)  # the context manager does not reach the callback's thread
+    try:
+        with jax.default_device(jax.local_devices(backend="cpu")[0]):
+            yield
+    finally:
+        jax.config.update("jax_enable_x64", before)
+
+
+@functools.cache
+def _solver(size: int) -> Callable[[Array], Any]:
+    """The compiled solve for `size` parameters."""
+    import equinox
+    import jax
+    import jax.numpy as jnp
+    import optimistix
+
+    shapes = (jax.ShapeDtypeStruct((size + 1,), jnp.float64), jax.ShapeDtypeStruct((size + 1, size), jnp.float64))
+
+    def visit(u: Any) -> Any:
+        return jax.pure_callback(lambda at: _ACTIVE[-1](at), shapes, u)
+
+    @jax.custom_jvp
+    def residual(u: Any) -> Any:
+        return visit(u)[0]
+
+    @residual.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        value, jacobian = visit(*primals)
+        return value, jacobian @ tangents[0]
+
+    # Accept every descent: a visit that does not lower |r| is then surely rejected, so that its Jacobian is never needed.
+    plain = optimistix.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE)
+    solver = equinox.tree_at(lambda s: s.search, plain, optimistix.ClassicalTrustRegion(low_cutoff=0.0))
+
+    def solve(start: Any) -> Any:
+        solution = optimistix.least_squares(lambda u, _: residual(u), solver, start, max_steps=MAX_STEPS, throw=False)
+        return solution.result == optimistix.RESULTS.successful
+
+    return jax.jit(solve)  # type: ignore[no-any-return]

@@ -1,0 +1,186 @@
+"""Result rows: how wrong a module is, and how long it takes."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, final
+
+import torch
+from torch import Tensor
+
+from torch_ssao import checks, metrics
+from torch_ssao.gbuffer import GBuffer
+from torch_ssao.modules import TECHNIQUES, AmbientVisibility
+from torch_ssao.report.truth import Truth
+
+REPEATS = 7
+"""Timed forward passes per module, after one that is not timed; at least 5, so that quartiles mean something."""
+
+
+@final
+@dataclass(frozen=True)
+class Score:
+    """Error of an estimate over all valid pixels of some views: RMSE and SSIM of visibility, PSNR in decibel."""
+
+    rmse: float
+    psnr: float
+    ssim: float
+
+
+@final
+@dataclass(frozen=True)
+class Timing:
+    """Milliseconds of one forward pass over one view without gradients: median and quartiles of `repeats`."""
+
+    median_ms: float
+    low_ms: float
+    high_ms: float
+    repeats: int
+
+
+@final
+@dataclass(frozen=True)
+class FitSummary:
+    """What a fit said: standard errors by parameter, parameters the data cannot determine, and how it went."""
+
+    standard_errors: dict[str, float]
+    undetermined: tuple[str, ...]
+    steps: int
+    evaluations: int
+    seconds: float
+    message: str
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One point of a speed-against-error plot.
+
+    Args:
+        name: unique, used in file names, such as "statvo_4".
+        label: for people, such as "4 layers".
+        module: what was measured.
+        validation: error on the judged views. training: error on the fitted views.
+        timing: of one judged view.
+        fit: None for a module with its default values.
+    """
+
+    name: str
+    label: str
+    module: AmbientVisibility
+    validation: Score
+    training: Score
+    timing: Timing
+    fit: FitSummary | None = None
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the values come from a fit."""
+        return self.fit is not None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The row as plain values for report.json."""
+        return {
+            "name": self.name,
+            "label": self.label,
+            "fitted": self.is_fitted,
+            "validation": asdict(self.validation),
+            "training": asdict(self.training),
+            "timing": asdict(self.timing),
+            "choices": self.module.config(),
+            "values": self.module.values(),
+            "fit": None if self.fit is None else asdict(self.fit),
+        }
+
+
+def candidates(technique: str, radius: float, layers: Sequence[int]) -> list[tuple[str, str, AmbientVisibility]]:
+    """Modules with default values but for the radius, one per layer count.
+
+    Args:
+        technique: a name in `modules.TECHNIQUES`.
+        radius: scene units, > 0.
+        layers: layer counts, each once; a technique that has none gives one module.
+    Returns: (name, label, module) for each.
+    Raises: ChoiceError for an unknown technique; RangeError for a radius, a layer count or a repetition that cannot be.
+    """
+    checks.check_choice("technique", technique, TECHNIQUES)
+    kind: Any = TECHNIQUES[technique]
+    if "layers" not in kind.CHOICES:
+        return [(technique, technique, kind(radius))]
+    if not layers or len(set(layers)) != len(layers):
+        raise checks.RangeError(f"layers must name layer counts, each once, got {tuple(layers)}: pass for example (1, 2, 4, 8)")
+    plural = {count: "layer" if count == 1 else "layers" for count in layers}
+    return [(f"{technique}_{n}", f"{n} {plural[n]}", kind(radius, layers=n)) for n in layers]
+
+
+def predict(module: AmbientVisibility, gbuffer: GBuffer) -> Tensor:
+    """(B, 1, H, W) visibility without gradients, view by view: the memory is that of one view."""
+    with torch.no_grad():
+        return torch.cat([module(gbuffer[i]) for i in range(len(gbuffer))])
+
+
+def score(prediction: Tensor, truth: Truth) -> Score:
+    """Error of (B, 1, H, W) visibility against a reference of the same views."""
+    arguments = (prediction, truth.visibility.to(prediction), truth.valid.to(prediction.device))
+    rmse, psnr, ssim = (float(metric(*arguments)) for metric in (metrics.rmse, metrics.psnr, metrics.ssim))
+    return Score(rmse, psnr, ssim)
+
+
+def score_constant(value: float, truth: Truth) -> Score:
+    """Error of a picture that has one value wherever a surface is seen."""
+    return score(torch.full_like(truth.visibility, value), truth)
+
+
+def best_constant(truth: Truth) -> float:
+    """The constant of least RMSE: the mean visibility of the valid pixels."""
+    return float(truth.visibility[truth.valid].double().mean())
+
+
+def time_forward(modules: Sequence[AmbientVisibility], gbuffer: GBuffer, *, repeats: int = REPEATS) -> list[Timing]:
+    """Milliseconds of one forward pass of each module without gradients.
+
+    Args:
+        modules: what to time. They take turns, so that a machine that slows down slows all of them.
+        gbuffer: one view.
+        repeats: timed passes a module, at least 5.
+    Raises: RangeError for fewer than 5 repeats.
+    """
+    checks.check_count("repeats", repeats, 5)
+    milliseconds: list[list[float]] = [[] for _ in modules]
+    with torch.no_grad():
+        for module in modules:
+            module(gbuffer)  # the first pass allocates and, on a GPU, loads kernels
+        for _ in range(repeats):
+            for module, taken in zip(modules, milliseconds, strict=True):
+                _wait(gbuffer)
+                start = time.perf_counter()
+                module(gbuffer)
+                _wait(gbuffer)
+                taken.append(1e3 * (time.perf_counter() - start))
+    return [_summary(taken) for taken in milliseconds]
+
+
+def _summary(taken: list[float]) -> Timing:
+    low, median, high = torch.tensor(taken, dtype=torch.float64).quantile(
+        torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)
+    ).tolist()
+    return Timing(median, low, high, len(taken))
+
+
+def _wait(gbuffer: GBuffer) -> None:
+    if gbuffer.depth.is_cuda:
+        torch.cuda.synchronize(gbuffer.depth.device)
+
+
+def plain(value: Any) -> Any:
+    """`value` with everything JSON cannot say (infinite, NaN) replaced by None, recursively."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

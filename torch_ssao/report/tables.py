@@ -1,0 +1,78 @@
+"""Tables for terminals and pages, from one list of cells."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from torch_ssao.report.rows import Row, Score
+from torch_ssao.report.truth import Ceiling
+
+if TYPE_CHECKING:
+    from torch_ssao.report.measure import Measurement
+
+COLUMNS = ("model", "RMSE", "PSNR", "SSIM", "training RMSE", "PSNR", "SSIM", "ms a view (quartiles)")
+
+
+def score_cells(measurement: Measurement) -> list[list[str]]:
+    """Rows of the table of errors under `COLUMNS`: untuned and fitted modules by layer count, constant image, noise ceiling."""
+    cells = [[_title(row), *_score(row.validation), *_score(row.training), _timing(row)] for row in measurement.rows]
+    constant = f"constant {measurement.constant.value:.3f}"
+    cells.append([constant, *_score(measurement.constant.validation), *_score(measurement.constant.training), ""])
+    return [*cells, ["noise ceiling", *_ceiling(measurement.ceiling), "", "", "", ""]]
+
+
+def value_cells(measurement: Measurement) -> list[list[str]]:
+    """Rows (model, parameter, value, standard error, unit and meaning) of every fitted parameter."""
+    cells = []
+    for row in measurement.rows:
+        if row.fit is None:
+            continue
+        for name, value in row.module.values().items():
+            spec = row.module.PARAMETERS[name]
+            cells.append([row.label, name, f"{value:.4g}", _uncertainty(row, name), f"{spec.meaning} ({spec.unit})"])
+    return cells
+
+
+def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Columns padded to equal width; the first is flush left, the others flush right."""
+    widths = [max(len(line[i]) for line in (head, *rows)) for i in range(len(head))]
+    lines = [
+        "  ".join(cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(line, widths, strict=True)))
+        for line in (head, ["-" * w for w in widths], *rows)
+    ]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def number(value: float, digits: int) -> str:
+    """`value` with `digits` decimals, "inf" or "-" where it is infinite or unknown."""
+    if math.isnan(value):
+        return "-"
+    return f"{value:.{digits}f}"
+
+
+def _title(row: Row) -> str:
+    return f"{row.label}, {'fitted' if row.is_fitted else 'untuned'}"
+
+
+def _score(score: Score) -> list[str]:
+    return [number(score.rmse, 4), number(score.psnr, 2), number(score.ssim, 4)]
+
+
+def _ceiling(ceiling: Ceiling) -> list[str]:
+    return [number(ceiling.rmse, 4), number(ceiling.psnr, 2), number(ceiling.ssim, 4)]
+
+
+def _timing(row: Row) -> str:
+    timing = row.timing
+    return f"{timing.median_ms:.1f} ({timing.low_ms:.1f}-{timing.high_ms:.1f})"
+
+
+def _uncertainty(row: Row, name: str) -> str:
+    if row.fit is None or (name not in row.fit.standard_errors and name not in row.fit.undetermined):
+        return "not fitted"
+    error = row.fit.standard_errors.get(name, math.nan)
+    if name in row.fit.undetermined or not math.isfinite(error):
+        return "not determined by these views"
+    return f"± {error:.2g}"
