@@ -49,7 +49,9 @@ class Camera:
         for name in ("fx", "fy", "cx", "cy"):
             tensor = getattr(self, name)
             checks.check_floating(name, tensor)
-            checks.check_shape(name, tensor, self.fx.shape if self.fx.ndim == 1 else ("B",), "give one value per camera")
+            checks.check_shape(
+                name, tensor, self.fx.shape if self.fx.ndim == 1 else ("B",), "give one value per camera"
+            )
         if self.world_to_view is not None:
             checks.check_floating("world_to_view", self.world_to_view)
             remedy = "give one 4x4 matrix per camera"
@@ -78,7 +80,9 @@ class Camera:
         """
         fov = torch.atleast_1d(torch.as_tensor(fov_y_deg, dtype=_float_dtype(fov_y_deg)))
         if not bool(((fov > 0) & (fov < 180)).all()):
-            raise checks.RangeError(f"fov_y_deg must lie in (0, 180) degrees, got {fov.tolist()}: pass degrees, not radians")
+            raise checks.RangeError(
+                f"fov_y_deg must lie in (0, 180) degrees, got {fov.tolist()}: pass degrees, not radians"
+            )
         focal = 0.5 * height / torch.tan(fov * (math.pi / 360.0))
         return _centred(focal, height, width, world_to_view, is_orthographic=False)
 
@@ -126,7 +130,13 @@ class Camera:
         checks.check_positive("K[1, 1] (fy)", K[:, 1, 1])
         shift = 0.5 if pixel_centers == "integer" else 0.0
         return Camera(
-            K[:, 0, 0], K[:, 1, 1], K[:, 0, 2] + shift, K[:, 1, 2] + shift, height, width, _pose(world_to_view, K.shape[0])
+            K[:, 0, 0],
+            K[:, 1, 1],
+            K[:, 0, 2] + shift,
+            K[:, 1, 2] + shift,
+            height,
+            width,
+            _pose(world_to_view, K.shape[0]),
         )
 
     @staticmethod
@@ -148,8 +158,9 @@ class Camera:
         clip = _ClipMatrix.read(P, convention)
         P = clip.matrix
         # For a perspective frustum the offset rides on z (third column), for an orthographic one it is a translation.
-        offset_x, offset_y = (P[:, 0, 3], P[:, 1, 3]) if clip.is_orthographic else (
-            clip.forward * P[:, 0, 2], clip.forward * P[:, 1, 2])
+        offset_x, offset_y = (
+            (P[:, 0, 3], P[:, 1, 3]) if clip.is_orthographic else (clip.forward * P[:, 0, 2], clip.forward * P[:, 1, 2])
+        )
         image_y = 1.0 if convention == "vulkan" else -1.0
         return Camera(
             fx=P[:, 0, 0].abs() * (width / 2),
@@ -199,7 +210,7 @@ class Camera:
         """
         focal = torch.stack((self.fx, self.fy), dim=1)[:, :, None, None, None].to(depth.dtype)
         spread = focal * length
-        return (spread.expand(-1, -1, *depth.shape[1:]) if self.is_orthographic else spread / depth[:, None])
+        return spread.expand(-1, -1, *depth.shape[1:]) if self.is_orthographic else spread / depth[:, None]
 
     # ---- batch and device --------------------------------------------------------------------------------------
 
@@ -208,7 +219,9 @@ class Camera:
         if len(self) == batch:
             return self
         if len(self) != 1:
-            raise checks.ShapeError(f"camera must have batch 1 or {batch}, got {len(self)}: give one camera per depth image")
+            raise checks.ShapeError(
+                f"camera must have batch 1 or {batch}, got {len(self)}: give one camera per depth image"
+            )
         return self._map(lambda tensor: tensor.expand(batch, *tensor.shape[1:]))
 
     def __getitem__(self, index: int | slice | Tensor | list[int]) -> Camera:
@@ -228,8 +241,13 @@ class Camera:
     def cat(cameras: list[Camera]) -> Camera:
         """Join cameras of one image size and kind along the batch."""
         first = cameras[0]
-        if any((c.height, c.width, c.is_orthographic) != (first.height, first.width, first.is_orthographic) for c in cameras):
-            raise checks.ShapeError("cameras must share height, width and projection kind: join only images of one size")
+        if any(
+            (c.height, c.width, c.is_orthographic) != (first.height, first.width, first.is_orthographic)
+            for c in cameras
+        ):
+            raise checks.ShapeError(
+                "cameras must share height, width and projection kind: join only images of one size"
+            )
         if len({c.world_to_view is None for c in cameras}) > 1:
             raise checks.ShapeError("cameras must all have a world_to_view or all have none: set the missing poses")
         joined = {n: torch.cat([getattr(c, n) for c in cameras]) for n in _TENSORS if getattr(first, n) is not None}

@@ -103,5 +103,7 @@ def check_output_folder(name: str, folder: str | Path) -> Path:
         probe.unlink()
     except OSError as error:
         reason = error.strerror or error
-        raise OutputError(f"{name} {str(path)!r} is not writable ({reason}): pass a folder that you may write to") from error
+        raise OutputError(
+            f"{name} {str(path)!r} is not writable ({reason}): pass a folder that you may write to"
+        ) from error
     return path

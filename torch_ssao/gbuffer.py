@@ -45,7 +45,9 @@ class GBuffer:
         remedy = "add the batch and layer dimensions, or use GBuffer.from_depth for plain depth maps"
         checks.check_shape("depth", self.depth, ("B", "L", "H", "W"), remedy)
         if not isinstance(self.camera, Camera):
-            raise checks.ShapeError(f"camera must be a torch_ssao.Camera, got {type(self.camera).__name__}: build one first")
+            raise checks.ShapeError(
+                f"camera must be a torch_ssao.Camera, got {type(self.camera).__name__}: build one first"
+            )
         batch, layers, height, width = self.depth.shape
         if (self.camera.height, self.camera.width) != (height, width):
             raise checks.ShapeError(
@@ -60,13 +62,17 @@ class GBuffer:
             checks.check_floating(name, tensor)
             checks.check_shape(name, tensor, shape, "one per pixel of depth")
             if tensor.dtype != self.depth.dtype:
-                raise checks.DtypeError(f"{name} must have depth's dtype {self.depth.dtype}, got {tensor.dtype}: convert one of them")
+                raise checks.DtypeError(
+                    f"{name} must have depth's dtype {self.depth.dtype}, got {tensor.dtype}: convert one of them"
+                )
         usable = torch.isfinite(self.depth) & (self.depth > 0)
         if self.valid is not None:
             checks.check_shape("valid", self.valid, self.depth.shape, "one flag per depth sample")
             if self.valid.dtype != torch.bool:
                 raise checks.DtypeError(f"valid must be bool, got {self.valid.dtype}: compare first, e.g. alpha > 0.5")
-        checks.check_same_device(depth=self.depth, normal=self.normal, valid=self.valid, triangles=self.triangles, fx=self.camera.fx)
+        checks.check_same_device(
+            depth=self.depth, normal=self.normal, valid=self.valid, triangles=self.triangles, fx=self.camera.fx
+        )
         object.__setattr__(self, "valid", usable if self.valid is None else usable & self.valid)
 
     @staticmethod
@@ -82,7 +88,9 @@ class GBuffer:
         """
         checks.check_floating("depth", depth)
         if depth.ndim not in (2, 3, 4):
-            raise checks.ShapeError(f"depth must have shape (H, W), (B, H, W) or (B, L, H, W), got {tuple(depth.shape)}: reshape it")
+            raise checks.ShapeError(
+                f"depth must have shape (H, W), (B, H, W) or (B, L, H, W), got {tuple(depth.shape)}: reshape it"
+            )
         if valid is not None:
             checks.check_shape("valid", valid, depth.shape, "one flag per depth value")
         lead = {2: (None, None), 3: (slice(None), None), 4: ()}[depth.ndim]
@@ -134,7 +142,9 @@ class GBuffer:
                 continue
             shapes = {None if tensor is None else tuple(tensor.shape[1:]) for tensor in tensors}
             if len(shapes) > 1:
-                raise checks.ShapeError(f"{name} must have one shape per image in every GBuffer, got {shapes}: pad or drop it first")
+                raise checks.ShapeError(
+                    f"{name} must have one shape per image in every GBuffer, got {shapes}: pad or drop it first"
+                )
             joined[name] = torch.cat(tensors)
         return replace(first, camera=Camera.cat([g.camera for g in gbuffers]), **joined)
 

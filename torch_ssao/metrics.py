@@ -50,7 +50,9 @@ def ssim(prediction: Tensor, target: Tensor, valid: Tensor | None = None, *, win
 
     valid = _check(prediction, target, valid)
     if min(prediction.shape[-2:]) < window:
-        raise checks.RangeError(f"window must fit the image {tuple(prediction.shape[-2:])}, got {window}: use a larger image")
+        raise checks.RangeError(
+            f"window must fit the image {tuple(prediction.shape[-2:])}, got {window}: use a larger image"
+        )
     prediction, target = (torch.where(valid, image, 1.0) for image in (prediction, target))
     quality = kornia_ssim(prediction, target, window, max_val=1.0)
     return torch.where(valid, quality, 0.0).sum() / valid.sum()

@@ -31,7 +31,9 @@ def save(module: AmbientVisibility, path: str | Path) -> None:
     """
     names = {kind: name for name, kind in TECHNIQUES.items()}
     if type(module) not in names:
-        raise ModuleFileError(f"module must be one of {', '.join(TECHNIQUES)}, got {type(module).__name__}: save its state_dict instead")
+        raise ModuleFileError(
+            f"module must be one of {', '.join(TECHNIQUES)}, got {type(module).__name__}: save its state_dict instead"
+        )
     raw = {name: getattr(module, f"raw_{name}").detach() for name in module.PARAMETERS}
     record = {
         "format": FORMAT,
@@ -82,5 +84,7 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise ModuleFileError(f"path {str(path)!r} is no torch_ssao module: pass a file that torch_ssao.save wrote")
     if record.get("version") != VERSION:
-        raise ModuleFileError(f"path {str(path)!r} has format version {record.get('version')}, this package reads {VERSION}: save it again")
+        raise ModuleFileError(
+            f"path {str(path)!r} has format version {record.get('version')}, this package reads {VERSION}: save it again"
+        )
     return record

@@ -1,88 +1,82 @@
-"""Small synthetic G-buffers: a floor and a back wall with boxes and spheres, made by ray intersection in torch."""
+"""Small G-buffers made by hand; every one is a function of a seed."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor
 
-from torch_ssao import Camera, GBuffer, look_at
+import torch_ssao as ts
 
 
-def clutter(
-    height: int = 48,
-    width: int = 64,
+def random_gbuffer(
+    seed: int,
     *,
-    views: int = 1,
-    seed: int = 0,
-    boxes: int = 8,
-    spheres: int = 5,
-    walls: bool = True,
-    dtype: torch.dtype = torch.float32,
-) -> GBuffer:
-    """A 6 x 6 floor (world y up) under boxes and spheres about 1 in size, seen from `views` sides; sky is invalid.
-
-    Args:
-        height, width: image size in pixels.
-        views: number of cameras, on an arc of 60 degrees.
-        seed: of the placement.
-        boxes, spheres: how many of each.
-        walls: whether there are two walls behind them; without them the horizon is sky.
-        dtype: of the result.
-    """
+    batch: int = 1,
+    peels: int = 1,
+    height: int = 13,
+    width: int = 17,
+    invalid: float = 0.1,
+    normals: bool = True,
+    orthographic: bool = False,
+    dtype: torch.dtype = torch.float64,
+) -> ts.GBuffer:
+    """Random depths around 2, random normals, an off-centre camera with fx != fy, a share of invalid pixels."""
     generator = torch.Generator().manual_seed(seed)
 
-    def uniform(count: int, low: float, high: float) -> Tensor:
-        return low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
-    low = torch.stack((uniform(boxes, -2.5, 1.5), torch.zeros(boxes).double(), uniform(boxes, -2.5, 1.5)), -1)
-    size = torch.stack((uniform(boxes, 0.3, 1.2), uniform(boxes, 0.2, 1.5), uniform(boxes, 0.3, 1.2)), -1)
-    slabs = [(low, low + size)]
-    if walls:
-        slabs.append((torch.tensor([[-3.1, 0, -3], [-3, 0, -3.1]]).double(), torch.tensor([[-3, 3, 3], [3, 3, -3]]).double()))
-    slabs.append((torch.tensor([[-3, -0.1, -3]]).double(), torch.tensor([[3.0, 0, 3]]).double()))
-    box_low, box_high = (torch.cat(parts) for parts in zip(*slabs, strict=True))
-    centre = torch.stack((uniform(spheres, -2, 2.5), uniform(spheres, 0.2, 0.6), uniform(spheres, -2, 2.5)), -1)
-    radius = uniform(spheres, 0.2, 0.6)
-    images = []
-    for view in range(views):
-        angle = math.radians(45 + (60 * view / max(views - 1, 1) - 30 if views > 1 else 0))
-        eye = torch.tensor([7 * math.sin(angle), 4.0, 7 * math.cos(angle)]).double()
-        pose = look_at(eye, torch.tensor([0, 0.5, 0]).double(), torch.tensor([0, 1, 0]).double())
-        camera = Camera.perspective(45.0, height, width, world_to_view=pose)
-        images.append(_cast(camera, pose, eye, (box_low, box_high), (centre, radius)).to(dtype))
-    return GBuffer.cat(images)
-
-
-def step(height: int = 48, width: int = 64, *, rise: float = 0.3, dtype: torch.dtype = torch.float32) -> GBuffer:
-    """Two fronto-parallel planes at depth 2 and 2 - rise, seen from above; no pixel is invalid."""
-    depth = torch.full((1, 1, height, width), 2.0, dtype=dtype)
-    depth[..., width // 2 :] -= rise
-    normal = torch.tensor([0, 0, -1], dtype=dtype).view(1, 3, 1, 1).expand(1, 3, height, width)
-    return GBuffer(depth, Camera.perspective(50.0, height, width).to(dtype), normal=normal)
+    depth = 1.5 + uniform(batch, peels, height, width) + torch.arange(peels)[None, :, None, None]
+    valid = uniform(batch, peels, height, width) >= invalid
+    normal = None
+    if normals:
+        tilt = uniform(batch, 3, height, width) - torch.tensor([0.5, 0.5, 1.5]).view(1, 3, 1, 1)
+        normal = torch.nn.functional.normalize(tilt, dim=1).to(dtype)
+    focal = (0.9 + 0.2 * uniform(batch)) * width
+    camera = ts.Camera(
+        focal.to(dtype),
+        (1.2 * focal).to(dtype),
+        (width / 2 + uniform(batch)).to(dtype),
+        (height / 2 - uniform(batch)).to(dtype),
+        height,
+        width,
+        is_orthographic=orthographic,
+    )
+    return ts.GBuffer(depth.to(dtype), camera, normal=normal, valid=valid)
 
 
-def _cast(
-    camera: Camera, pose: Tensor, eye: Tensor, boxes: tuple[Tensor, Tensor], spheres: tuple[Tensor, Tensor]
-) -> GBuffer:
-    x, y = camera.rays(dtype=torch.float64)
-    x, y = torch.broadcast_tensors(x, y)
-    ray = torch.stack((x, y, torch.ones_like(x)), -1)[0] @ pose[:3, :3]  # unit view depth per unit of t: t is the depth
-    low, high = (((bound - eye) / ray[..., None, :]) for bound in boxes)  # (H, W, N, 3)
-    near, axis = torch.minimum(low, high).max(-1)
-    far = torch.maximum(low, high).amin(-1)
-    near = torch.where((near < far) & (near > 0), near, torch.inf)
-    depth, first = near.min(-1)
-    axis = axis.gather(-1, first[..., None])[..., 0]
-    normal = torch.nn.functional.one_hot(axis, 3).double() * -ray.gather(-1, axis[..., None]).sign()
-    for centre, radius in zip(*spheres, strict=True):
-        a, b = (ray * ray).sum(-1), (ray * (eye - centre)).sum(-1)
-        root = b * b - a * ((eye - centre).square().sum() - radius**2)
-        t = torch.where(root > 0, (-b - root.clamp(min=0).sqrt()) / a, torch.inf)
-        closer = (t < depth) & (t > 0)
-        outward = (eye + torch.where(closer, t, 0.0)[..., None] * ray - centre) / radius
-        depth = torch.where(closer, t, depth)
-        normal = torch.where(closer[..., None], outward, normal)
-    normal = (normal @ pose[:3, :3].T).permute(2, 0, 1)
-    return GBuffer(depth[None, None], camera, normal=normal[None])
+def plane_gbuffer(
+    view_angle_deg: float,
+    *,
+    height: int = 48,
+    width: int = 64,
+    distance: float = 4.0,
+    fov_y_deg: float = 50.0,
+    orthographic: bool = False,
+    dtype: torch.dtype = torch.float32,
+) -> ts.GBuffer:
+    """An infinite plane seen at an angle from its normal, with its exact depth and normal."""
+    if orthographic:
+        camera = ts.Camera.orthographic(2.0, height, width)
+    else:
+        camera = ts.Camera.perspective(fov_y_deg, height, width)
+    angle = torch.deg2rad(torch.tensor(view_angle_deg, dtype=torch.float64))
+    normal = torch.stack((torch.zeros_like(angle), -torch.sin(angle), -torch.cos(angle)))
+    x, y = camera.to(torch.float64).rays()
+    if orthographic:
+        depth = distance - (y * normal[1] + x * 0) / normal[2]
+    else:
+        facing = y * normal[1] + normal[2] + x * 0  # plane: n . p = distance * n_z
+        depth = torch.where(facing < 0, distance * normal[2] / facing, torch.inf)
+    image = normal.view(1, 3, 1, 1).expand(1, 3, height, width).to(dtype)
+    return ts.GBuffer(depth[:, None].to(dtype), camera.to(dtype), normal=image)
+
+
+def steps_gbuffer(*, height: int = 48, width: int = 64, dtype: torch.dtype = torch.float32) -> ts.GBuffer:
+    """Smooth bumps with a raised block: a scene with both curved surfaces and depth discontinuities."""
+    camera = ts.Camera.perspective(50.0, height, width).to(dtype)
+    v = torch.linspace(-1, 1, height, dtype=torch.float64)[:, None]
+    u = torch.linspace(-1.3, 1.3, width, dtype=torch.float64)
+    depth = 4 + 0.25 * torch.sin(5 * u) * torch.cos(4 * v) - 0.3 * torch.exp(-8 * ((u + 0.6) ** 2 + (v - 0.3) ** 2))
+    depth = torch.where((u > 0.1) & (u < 0.7) & (v.abs() < 0.45), torch.full_like(depth, 3.0), depth)
+    return ts.GBuffer.from_depth(depth.to(dtype), camera)

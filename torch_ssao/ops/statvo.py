@@ -124,11 +124,15 @@ class _StatVOBackward(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> None:
-        raise RuntimeError("statvo_obscurance has no second derivative: detach the first gradient, or difference it numerically")
+        raise RuntimeError(
+            "statvo_obscurance has no second derivative: detach the first gradient, or difference it numerically"
+        )
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> None:
-        raise RuntimeError("statvo_obscurance has no second derivative: detach the first gradient, or difference it numerically")
+        raise RuntimeError(
+            "statvo_obscurance has no second derivative: detach the first gradient, or difference it numerically"
+        )
 
 
 class _Frame:
@@ -162,10 +166,14 @@ class _Frame:
         kept = self.seen & (leaf.count > 0)
         safe = count.clamp(min=MIN_COUNT)
         per_rise = torch.where(kept, leaf.to_height / (safe * self.box_height), 0.0)
-        to_count = torch.where(kept, (leaf.value - obscurance) / safe, 0.0) - per_rise * (leaf.mean * self.normal).sum(-1)
+        to_count = torch.where(kept, (leaf.value - obscurance) / safe, 0.0) - per_rise * (leaf.mean * self.normal).sum(
+            -1
+        )
         return torch.cat((per_rise[..., None] * self.normal, to_count[..., None]), -1), per_rise * leaf.count
 
-    def pull_back(self, grad: Tensor, obscurance: Tensor, labels: Tensor, count: Tensor, layers: int) -> tuple[Tensor, ...]:
+    def pull_back(
+        self, grad: Tensor, obscurance: Tensor, labels: Tensor, count: Tensor, layers: int
+    ) -> tuple[Tensor, ...]:
         """Cotangents of points, normal, half, box_height and slope."""
         points, half = self.inputs.points, self.inputs.half
         grad, obscurance = grad.double().flatten(1), obscurance.double().flatten(1)
@@ -200,9 +208,7 @@ class _Frame:
             to_slope.to(dtype),
         )
 
-    def push_forward(
-        self, tangents: _Inputs, obscurance: Tensor, labels: Tensor, count: Tensor, layers: int
-    ) -> Tensor:
+    def push_forward(self, tangents: _Inputs, obscurance: Tensor, labels: Tensor, count: Tensor, layers: int) -> Tensor:
         """Tangent of the obscurance, (B, N); tangents that are None cost nothing."""
         obscurance = obscurance.double().flatten(1)
         edges = None if tangents.half is None else self._edges_from_half(tangents.half[:, :, 0].double())
