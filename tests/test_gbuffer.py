@@ -6,10 +6,10 @@ import math
 
 import pytest
 import torch
-from support.gbuffers import plane_gbuffer, random_gbuffer
 from torch.utils import _pytree as pytree
 
 import torch_ssao as ts
+from support.gbuffers import plane_gbuffer, random_gbuffer
 from torch_ssao import checks
 
 CAMERA = ts.Camera.perspective(60.0, 2, 3)

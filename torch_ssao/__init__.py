@@ -7,13 +7,13 @@ from typing import Any
 
 from torch_ssao import metrics as metrics
 from torch_ssao.camera import Camera as Camera
-from torch_ssao.camera import depth_from_zbuffer as depth_from_zbuffer
 from torch_ssao.camera import look_at as look_at
-from torch_ssao.camera import opengl_to_view as opengl_to_view
-from torch_ssao.camera import zbuffer_from_depth as zbuffer_from_depth
 from torch_ssao.gbuffer import GBuffer as GBuffer
 from torch_ssao.gbuffer import collate as collate
 from torch_ssao.modules import StatVO as StatVO
+from torch_ssao.projection import depth_from_zbuffer as depth_from_zbuffer
+from torch_ssao.projection import opengl_to_view as opengl_to_view
+from torch_ssao.projection import zbuffer_from_depth as zbuffer_from_depth
 from torch_ssao.serialize import load as load
 from torch_ssao.serialize import save as save
 

@@ -25,13 +25,13 @@ class GBuffer:
         depth: (B, L, H, W) view-space z in scene units, floating point; `depth[:, 0]` is the nearest surface, deeper
             layers follow. Pixels with z <= 0, inf or NaN are invalid.
         camera: `Camera` of batch B or 1, with the image size H x W.
-        normal: (B, 3, H, W) unit view-space normals towards the eye, dtype of depth; None leaves view-aligned techniques only.
+        normal: (B, 3, H, W) unit view-space normals towards the eye, dtype of depth; None: view-aligned techniques only.
         valid: (B, L, H, W) bool, further pixels to leave out (sky, transparency); None keeps all with a usable depth.
         triangles: (B, 3, 3, H, W) vertices of the visible triangle (vertex, xyz), for triangle-buffer techniques.
 
     Raises: ShapeError, DtypeError, DeviceError.
-    Gradients: to depth, normal, triangles and the camera; invalid pixels receive exactly 0. G-buffers are pytrees: build one
-        inside the function that you differentiate, or map over it with `torch.func.vmap`.
+    Gradients: to depth, normal, triangles and the camera; invalid pixels receive exactly 0. G-buffers are pytrees:
+        build one inside the function that you differentiate, or map over it with `torch.func.vmap`.
     """
 
     depth: Tensor
@@ -48,7 +48,7 @@ class GBuffer:
             raise checks.ShapeError(
                 f"camera must be a torch_ssao.Camera, got {type(self.camera).__name__}: build one first"
             )
-        batch, layers, height, width = self.depth.shape
+        batch, _, height, width = self.depth.shape
         if (self.camera.height, self.camera.width) != (height, width):
             raise checks.ShapeError(
                 f"camera must have the image size of depth, {height}x{width}, got {self.camera.height}x{self.camera.width}: "

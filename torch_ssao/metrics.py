@@ -41,7 +41,7 @@ def ssim(prediction: Tensor, target: Tensor, valid: Tensor | None = None, *, win
             this library's images.
         valid: (B, 1, H, W) bool, None for all.
         window: odd width of the Gaussian window in pixels.
-    Returns: 0-d tensor, at most 1. It falls with the noise of the target: quote it beside the reference's own ceiling.
+    Returns: 0-d tensor, at most 1. It falls with the target's noise: quote it beside the reference's own ceiling.
     Raises: ShapeError; RangeError when no pixel is valid or the image is smaller than the window.
     Gradients: to prediction and target.
     Source: Wang et al. 2004, kornia.metrics.ssim.

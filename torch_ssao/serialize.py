@@ -85,6 +85,6 @@ def _read(path: Path) -> dict[str, Any]:
         raise ModuleFileError(f"path {str(path)!r} is no torch_ssao module: pass a file that torch_ssao.save wrote")
     if record.get("version") != VERSION:
         raise ModuleFileError(
-            f"path {str(path)!r} has format version {record.get('version')}, this package reads {VERSION}: save it again"
+            f"path {str(path)!r} has version {record.get('version')}, this package reads {VERSION}: save it again"
         )
     return record

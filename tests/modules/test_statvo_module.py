@@ -8,9 +8,9 @@ import pickle
 
 import pytest
 import torch
-from support.gbuffers import random_gbuffer, steps_gbuffer
 
 import torch_ssao as ts
+from support.gbuffers import random_gbuffer, steps_gbuffer
 from torch_ssao import checks
 from torch_ssao.serialize import ModuleFileError
 

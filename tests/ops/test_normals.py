@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from support.gbuffers import plane_gbuffer
 
 import torch_ssao as ts
+from support.gbuffers import plane_gbuffer
 from torch_ssao.ops import normals_from_points
 
 

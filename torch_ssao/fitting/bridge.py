@@ -17,8 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_ssao import checks
-
 Array = NDArray[np.float64]
 Evaluate = Callable[[Array], tuple[Array, Array]]
 
@@ -29,6 +27,10 @@ _LOCK = threading.Lock()  # jax's float64 flag is global, and so is the evaluati
 _ACTIVE: list[_Visit] = []
 
 
+class MissingExtraError(ValueError):
+    """A library of an optional extra is not installed."""
+
+
 class StopSolver(Exception):
     """Raised by an evaluation to end the solve early."""
 
@@ -36,7 +38,7 @@ class StopSolver(Exception):
 def check_installed() -> None:
     """Raise `MissingExtraError` unless optimistix can be imported."""
     if importlib.util.find_spec("optimistix") is None:
-        raise checks.MissingExtraError("fit needs optimistix, which is not installed: run pip install torch_ssao[fitting]")
+        raise MissingExtraError("fit needs optimistix, which is not installed: run pip install torch_ssao[fitting]")
 
 
 def levenberg_marquardt(evaluate: Evaluate, start: Array) -> bool:
@@ -120,12 +122,20 @@ def _solver(size: int) -> Callable[[Array], Any]:
         value, jacobian = visit(*primals)
         return value, jacobian @ tangents[0]
 
-    # Accept every descent: a visit that does not lower |r| is then surely rejected, so that its Jacobian is never needed.
     plain = optimistix.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE)
-    solver = equinox.tree_at(lambda s: s.search, plain, optimistix.ClassicalTrustRegion(low_cutoff=0.0))
+    solver = equinox.tree_at(lambda s: s.search, plain, _trust_region(optimistix))
 
     def solve(start: Any) -> Any:
         solution = optimistix.least_squares(lambda u, _: residual(u), solver, start, max_steps=MAX_STEPS, throw=False)
         return solution.result == optimistix.RESULTS.successful
 
     return jax.jit(solve)  # type: ignore[no-any-return]
+
+
+def _trust_region(optimistix: Any) -> Any:
+    """Accept every descent: a visit that does not lower |r| is then surely rejected, and its Jacobian is never needed.
+
+    The damping falls tenfold after a step that did at least half of what was predicted (optimistix asks for 99 %, which labels that
+    flip never let a step reach).
+    """
+    return optimistix.ClassicalTrustRegion(low_cutoff=0.0, high_cutoff=0.5, high_constant=10.0)

@@ -56,7 +56,8 @@ class Positive:
 class AmbientVisibility(nn.Module, abc.ABC):
     """Abstract base: a module from a G-buffer to ambient visibility.
 
-    A technique names its continuous parameters in `PARAMETERS`, declares one `Positive` for each, and computes `_visibility`.
+    A technique names its continuous parameters in `PARAMETERS`, declares one `Positive` for each, and computes
+    `_visibility`.
     """
 
     PARAMETERS: ClassVar[dict[str, ParameterSpec]]

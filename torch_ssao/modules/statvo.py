@@ -16,19 +16,19 @@ from torch_ssao.ops.statvo import statvo_obscurance
 class StatVO(AmbientVisibility):
     """Statistical volumetric obscurance: visibility from the mean position of a few depth layers around each pixel.
 
-    Surface-aligned where the G-buffer has normals, view-aligned where it has none. No sampling, hence no noise and no blur.
+    Surface-aligned where the G-buffer has normals, view-aligned where it has none. No sampling, so no noise, no blur.
 
     Args:
         radius: half-size of the sample box across the surface, scene units, > 0.
         height: height of the box over the surface, of the radius, > 0.
         falloff: slope of psi above the box: how fast layers in front of it stop to occlude, > 0.
         contrast: exponent of the visibility, > 0.
-        layers: adaptive depth layers, 1, 2, 4, ... 256. One for scenes without depth discontinuities; more remove halos.
+        layers: adaptive depth layers, 1, 2, 4, ... 256. One without depth discontinuities; more remove halos.
         layering: "adaptive".
         learnable: names of the parameters to register as `nn.Parameter`s, or "all"; the rest are buffers.
     Raises:
         RangeError, ChoiceError.
-    Gradients, Cost, Source: see `ops.statvo.statvo_obscurance`. With one layer, `falloff` still acts on means above the box.
+    Gradients, Cost, Source: see `ops.statvo.statvo_obscurance`.
     """
 
     PARAMETERS = {

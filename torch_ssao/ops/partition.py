@@ -13,8 +13,8 @@ ROUNDING = 8.0  # depths and heights within this many units of rounding count as
 def adaptive_labels(depth: Tensor, valid: Tensor, half: Tensor, layers: int) -> Tensor:
     """Layer of every sample: each round splits a node at its own local mean depth.
 
-    A sample goes to the upper (nearer) child where its depth is less than the mean depth of its node's valid samples in its
-    own window, else to the lower; log2(layers) rounds.
+    A sample goes to the upper (nearer) child where its depth is less than the mean depth of its node's valid samples
+    in its own window, else to the lower; log2(layers) rounds.
 
     Args:
         depth: (B, L, H, W) view-space z, finite everywhere, scene units.
@@ -27,20 +27,28 @@ def adaptive_labels(depth: Tensor, valid: Tensor, half: Tensor, layers: int) -> 
     Source: Statistical Volumetric Obscurance, Sec. 5.
     """
     labels = torch.zeros_like(depth, dtype=torch.uint8)
-    tolerance = ROUNDING * torch.finfo(depth.dtype).eps * depth.abs()
+    input_rounding = ROUNDING * torch.finfo(depth.dtype).eps * depth.abs()
+    lost = table_rounding(depth, valid)[..., None, None]
     windows = [Window.around_pixels(half[:, :, peel]) for peel in range(depth.shape[1])]
     for level in range(layers.bit_length() - 1):
         split = torch.zeros_like(labels)
         for node in range(2**level):
             inside = valid & (labels == node)
             table = summed_area_table(torch.stack((torch.where(inside, depth, 0.0), inside.to(depth.dtype)), -1).sum(1))
-            mean = torch.stack([_mean(table, window) for window in windows], 1).view_as(depth)
-            lower = (depth >= mean - tolerance).to(torch.uint8)
-            split = torch.where(inside, 2 * node + lower, split)
+            total, count = torch.stack([box_sum(table, window) for window in windows], 1).unbind(-1)
+            count = count.clamp(min=1e-12).view_as(depth)  # a window of no samples belongs to nobody: any value will do
+            lower = depth >= total.view_as(depth) / count - input_rounding - lost / count
+            split = torch.where(inside, 2 * node + lower.to(torch.uint8), split)
         labels = split
     return labels
 
 
-def _mean(table: Tensor, window: Window) -> Tensor:
-    total, count = box_sum(table, window).unbind(-1)
-    return total / count.clamp(min=1e-12)  # a window of no samples belongs to nobody: any finite value will do
+def table_rounding(size: Tensor, valid: Tensor) -> Tensor:
+    """Bound on the rounding of a float64 box sum of samples of the given size, (B, 1).
+
+    Args:
+        size: (B, L, H, W) magnitude of the samples.
+        valid: (B, L, H, W) bool.
+    """
+    total = torch.where(valid, size, 0.0).double().flatten(1).sum(1, keepdim=True)
+    return ROUNDING * torch.finfo(torch.float64).eps * total

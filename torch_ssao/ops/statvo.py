@@ -1,4 +1,4 @@
-"""Statistical volumetric obscurance: partition, masked summed-area tables, box means and psi in one autograd Function."""
+"""Statistical volumetric obscurance: partition, masked tables, box means and psi in one autograd Function."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_ssao.ops import sat
 from torch_ssao.ops.falloff import psi
-from torch_ssao.ops.partition import ROUNDING, adaptive_labels
+from torch_ssao.ops.partition import ROUNDING, adaptive_labels, table_rounding
 from torch_ssao.ops.sat import Window
 
 MIN_COUNT = 1e-6  # pixels of a layer inside a window below which its mean is all rounding: the layer is left out
@@ -21,8 +21,8 @@ def statvo_obscurance(
 ) -> Tensor:
     """Obscurance of every pixel from the mean position of each layer in its window.
 
-    VO = sum_i n_i psi(((mean_i - x) . n) / box_height) / sum_i n_i over the layers i, with n_i the samples of layer i in the
-    window and mean_i their mean position.
+    VO = sum_i n_i psi(((mean_i - x) . n) / box_height) / sum_i n_i over the layers i, with n_i the samples of layer i
+    in the window and mean_i their mean position.
 
     Args:
         points: (B, 3, L, H, W) view-space positions, scene units, finite everywhere; layer 0 holds the centres x.
@@ -32,11 +32,12 @@ def statvo_obscurance(
         box_height: (B,) height of the sample box over the surface, scene units, > 0.
         slope: (B,) slope of psi above the box, > 0.
         layers: 1, 2, 4, ... 256 adaptive layers.
-    Returns: (B, H, W) obscurance in [0, 1], 0 where the centre is invalid; heights within rounding of the surface give 0.
-    Gradients: to points, normal, half (of layer 0), box_height and slope: exact almost everywhere, labels held constant. Forward
-        mode (`jvp`) alike. Second derivatives raise a RuntimeError.
-    Cost: layers - 1 two-channel and `layers` four-channel float64 tables, one alive at a time, forward; about three times that
-        backward. Saved for backward: the inputs, one byte and one float64 a pixel, whatever the number of layers.
+    Returns: (B, H, W) obscurance in [0, 1], 0 where the centre is invalid. Heights within rounding of the surface -
+        8 eps |x| of the input's dtype plus what the float64 table loses - count as 0 with gradient 0: a plane is open.
+    Gradients: to points, normal, half (of layer 0), box_height and slope: exact almost everywhere, labels held
+        constant. Forward mode (`jvp`) alike. Second derivatives raise a RuntimeError.
+    Cost: layers - 1 two-channel and `layers` four-channel float64 tables, one alive at a time, forward; about three
+        times that backward. Saved for backward: the inputs, one byte and one float64 a pixel, whatever the layers.
     Source: Statistical Volumetric Obscurance, Eqs. 3-7, Sec. 5 and 6.
     """
     function = _StatVO if torch.compiler.is_compiling() else _StatVOWithJvp
@@ -109,7 +110,7 @@ class _StatVOWithJvp(_StatVO):
 
 
 class _StatVOBackward(torch.autograd.Function):
-    """The backward pass as a Function of its own, so that differentiating it again is an error and never a silent zero."""
+    """The backward pass as a Function of its own: differentiating it again is an error, never a silent zero."""
 
     generate_vmap_rule = True
 
@@ -147,7 +148,8 @@ class _Frame:
         self.slope = inputs.slope.double()[:, None]
         self.seen = inputs.valid[:, 0].flatten(1)
         self.reach = torch.linalg.vector_norm(self.centre, dim=-1)
-        self.tolerance = ROUNDING * torch.finfo(inputs.points.dtype).eps * self.reach
+        self.input_rounding = ROUNDING * torch.finfo(inputs.points.dtype).eps * self.reach
+        self.table_rounding = table_rounding(torch.linalg.vector_norm(inputs.points, dim=1), inputs.valid)
 
     def leaves(self, labels: Tensor, layers: int) -> Iterator[_Leaf]:
         """The layers one by one, so that one table is alive at a time."""
@@ -158,11 +160,12 @@ class _Frame:
             count = torch.where(sums[..., 3] >= MIN_COUNT, sums[..., 3], 0.0)
             mean = sums[..., :3] / sums[..., 3:].clamp(min=MIN_COUNT)
             rise = ((mean - self.centre) * self.normal).sum(-1)
-            height = torch.where(rise > self.tolerance, rise / self.box_height, 0.0)
+            tolerance = self.input_rounding + self.table_rounding / sums[..., 3].clamp(min=MIN_COUNT)
+            height = torch.where(rise > tolerance, rise / self.box_height, 0.0)
             yield _Leaf(member, table, count, mean, height, *psi(height, self.slope))
 
     def derivatives(self, leaf: _Leaf, obscurance: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-        """d VO / d (sums of this layer), (B, N, 4), and d VO / d rise * n, (B, N); zero at unseen centres and left-out layers."""
+        """d VO / d (sums of this layer), (B, N, 4), and d VO / d rise, (B, N); zero where unseen or left out."""
         kept = self.seen & (leaf.count > 0)
         safe = count.clamp(min=MIN_COUNT)
         per_rise = torch.where(kept, leaf.to_height / (safe * self.box_height), 0.0)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+from torch_ssao.scenes.builtin import builtin as builtin
+from torch_ssao.scenes.builtin import names as names
+from torch_ssao.scenes.loading import load as load
 from torch_ssao.scenes.render import PrimaryHits as PrimaryHits
 from torch_ssao.scenes.render import primary_hits as primary_hits
 from torch_ssao.scenes.render import render as render
