@@ -251,11 +251,13 @@ class Camera:
             )
         if len({c.world_to_view is None for c in cameras}) > 1:
             raise checks.ShapeError("cameras must all have a world_to_view or all have none: set the missing poses")
-        joined = {n: torch.cat([getattr(c, n) for c in cameras]) for n in _TENSORS if getattr(first, n) is not None}
+        joined: dict[str, Any] = {
+            n: torch.cat([getattr(c, n) for c in cameras]) for n in _TENSORS if getattr(first, n) is not None
+        }
         return replace(first, **joined)
 
     def _map(self, function: Any) -> Camera:
-        changed = {n: function(getattr(self, n)) for n in _TENSORS if getattr(self, n) is not None}
+        changed: dict[str, Any] = {n: function(getattr(self, n)) for n in _TENSORS if getattr(self, n) is not None}
         return replace(self, **changed)
 
 

@@ -25,7 +25,7 @@ class GBuffer:
         depth: (B, L, H, W) view-space z in scene units, floating point; `depth[:, 0]` is the nearest surface, deeper
             layers follow. Pixels with z <= 0, inf or NaN are invalid.
         camera: `Camera` of batch B or 1, with the image size H x W.
-        normal: (B, 3, H, W) unit view-space normals towards the eye, dtype of depth; None: view-aligned techniques only.
+        normal: (B, 3, H, W) unit view-space normals towards the eye, dtype of depth; None: view-aligned only.
         valid: (B, L, H, W) bool, further pixels to leave out (sky, transparency); None keeps all with a usable depth.
         triangles: (B, 3, 3, H, W) vertices of the visible triangle (vertex, xyz), for triangle-buffer techniques.
 
@@ -51,8 +51,8 @@ class GBuffer:
         batch, _, height, width = self.depth.shape
         if (self.camera.height, self.camera.width) != (height, width):
             raise checks.ShapeError(
-                f"camera must have the image size of depth, {height}x{width}, got {self.camera.height}x{self.camera.width}: "
-                "build it with depth's height and width"
+                f"camera must have the image size of depth, {height}x{width}, "
+                f"got {self.camera.height}x{self.camera.width}: build it with depth's height and width"
             )
         object.__setattr__(self, "camera", self.camera.expand(batch))
         for name, shape in (("normal", (batch, 3, height, width)), ("triangles", (batch, 3, 3, height, width))):

@@ -37,8 +37,8 @@ def ssim(prediction: Tensor, target: Tensor, valid: Tensor | None = None, *, win
     """Mean structural similarity over the valid pixels, by kornia, for a dynamic range of 1.
 
     Args:
-        prediction, target: (B, 1, H, W) visibility in [0, 1]; both are set to 1 at invalid pixels first, the convention of
-            this library's images.
+        prediction, target: (B, 1, H, W) visibility in [0, 1]; both are set to 1 at invalid pixels first, the
+            convention of this library's images.
         valid: (B, 1, H, W) bool, None for all.
         window: odd width of the Gaussian window in pixels.
     Returns: 0-d tensor, at most 1. It falls with the target's noise: quote it beside the reference's own ceiling.

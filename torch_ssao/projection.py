@@ -76,8 +76,8 @@ class ClipMatrix:
         whole = bool(orthographic.all()) or not bool(orthographic.any())
         if not whole or bool((P[:, [0, 1], [0, 1]] == 0).any()):
             raise checks.RangeError(
-                "P must be perspective or orthographic clip matrices for column vectors (clip = P @ view), got neither or a "
-                "mixture: transpose row-vector matrices, and split mixed batches"
+                "P must be perspective or orthographic clip matrices for column vectors (clip = P @ view), got neither "
+                "or a mixture: transpose row-vector matrices, and split mixed batches"
             )
         if bool(orthographic.all()):
             # Depth in the buffer grows with distance, except in reversed z.

@@ -85,8 +85,8 @@ class AmbientVisibility(nn.Module, abc.ABC):
     ) -> Tensor:
         """(B, H, W) visibility before contrast.
 
-        `depth` (B, L, H, W) and `normal` (B, 3, H, W) are finite everywhere and at least float32; what is returned at invalid
-        pixels is ignored.
+        `depth` (B, L, H, W) and `normal` (B, 3, H, W) are finite everywhere and at least float32; what is returned at
+        invalid pixels is ignored.
         """
 
     @abc.abstractmethod

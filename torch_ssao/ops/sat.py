@@ -7,6 +7,7 @@ Tables are float64 whatever the input: a float32 table loses the small differenc
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -88,15 +89,13 @@ def box_sum(table: Tensor, window: Window) -> Tensor:
         window: N windows per image.
     Returns: (B, N, C) float64 sums, weighted by the covered area of each pixel.
     Gradients: `box_sum_edges` and `box_sum_adjoint` give the derivative to the edges and to the table.
-    Cost: 16 reads of C values a window, whatever its size.
+    Cost: 8 reads of 2 C values a window, whatever its size.
     Source: the bilinear lookup of a SAT at fractional corners is the exact integral (Leibniz).
     """
-    total = None
-    for x, y, sign in window.corners():
-        for index, weight in _taps(x, y, table.shape):
-            part = _read(table, index) * (sign * weight)[..., None]
-            total = part if total is None else total + part
-    return total if total is not None else table.new_zeros(0)
+    upper, lower = _edge_rows(table, window, window.y0), _edge_rows(table, window, window.y1)
+    return torch.lerp(lower.first.width, lower.second.width, lower.fraction) - torch.lerp(
+        upper.first.width, upper.second.width, upper.fraction
+    )
 
 
 def box_sum_edges(table: Tensor, window: Window) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -105,16 +104,13 @@ def box_sum_edges(table: Tensor, window: Window) -> tuple[Tensor, Tensor, Tensor
     Args and Cost as for `box_sum`.
     Returns: four (B, N, C) tensors.
     """
-    slopes = {}
-    for edge in ("x0", "x1"):
-        x = getattr(window, edge)
-        sign = -1.0 if edge == "x0" else 1.0
-        slopes[edge] = sign * (_slope_x(table, x, window.y1) - _slope_x(table, x, window.y0))
-    for edge in ("y0", "y1"):
-        y = getattr(window, edge)
-        sign = -1.0 if edge == "y0" else 1.0
-        slopes[edge] = sign * (_slope_y(table, window.x1, y) - _slope_y(table, window.x0, y))
-    return slopes["x0"], slopes["x1"], slopes["y0"], slopes["y1"]
+    upper, lower = _edge_rows(table, window, window.y0), _edge_rows(table, window, window.y1)
+    left, right = (
+        torch.lerp(getattr(lower.first, side), getattr(lower.second, side), lower.fraction)
+        - torch.lerp(getattr(upper.first, side), getattr(upper.second, side), upper.fraction)
+        for side in ("left", "right")
+    )
+    return -left, right, upper.first.width - upper.second.width, lower.second.width - lower.first.width
 
 
 def box_sum_adjoint(grad: Tensor, window: Window) -> Tensor:
@@ -147,23 +143,38 @@ def _taps(x: Tensor, y: Tensor, shape: tuple[int, ...] | torch.Size) -> list[tup
     ]
 
 
-def _slope_x(table: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """d/dx of the bilinear lookup at (x, y)."""
-    (column, _), (row, below) = _split(x, table.shape[2] - 1), _split(y, table.shape[1] - 1)
-    top = _base(table.shape, x.device) + row * table.shape[2] + column
-    bottom = top + table.shape[2]
-    rise_top = _read(table, top + 1) - _read(table, top)
-    rise_bottom = _read(table, bottom + 1) - _read(table, bottom)
-    return rise_top + (rise_bottom - rise_top) * below[..., None]
+class _Row(NamedTuple):
+    """One table row at the two vertical edges of every window: all (B, N, C)."""
+
+    width: Tensor  # row sum between x0 and x1
+    left: Tensor  # slope of the row at x0
+    right: Tensor  # slope of the row at x1
 
 
-def _slope_y(table: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """d/dy of the bilinear lookup at (x, y)."""
-    (column, right), (row, _) = _split(x, table.shape[2] - 1), _split(y, table.shape[1] - 1)
-    left = _base(table.shape, x.device) + row * table.shape[2] + column
-    rise_left = _read(table, left + table.shape[2]) - _read(table, left)
-    rise_right = _read(table, left + table.shape[2] + 1) - _read(table, left + 1)
-    return rise_left + (rise_right - rise_left) * right[..., None]
+class _EdgeRows(NamedTuple):
+    first: _Row
+    second: _Row
+    fraction: Tensor  # (B, N, 1), where the horizontal edge lies between the two rows
+
+
+def _edge_rows(table: Tensor, window: Window, y: Tensor) -> _EdgeRows:
+    """The two table rows around a horizontal edge."""
+    batch, height, width, channels = table.shape
+    neighbours = table.reshape(-1).unfold(0, 2 * channels, channels)  # entry and its right neighbour in one read
+    row, fraction = _split(y, height - 1)
+    start = _base(table.shape, table.device) + row * width
+    edges = [_split(x, width - 1) for x in (window.x0, window.x1)]
+
+    def read(start: Tensor) -> _Row:
+        values, slopes = [], []
+        for column, part in edges:
+            pair = neighbours.index_select(0, (start + column).flatten()).view(batch, -1, 2, channels)
+            slope = pair[:, :, 1] - pair[:, :, 0]
+            values.append(torch.addcmul(pair[:, :, 0], slope, part[..., None]))
+            slopes.append(slope)
+        return _Row(values[1] - values[0], *slopes)
+
+    return _EdgeRows(read(start), read(start + width), fraction[..., None])
 
 
 def _split(position: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -175,8 +186,3 @@ def _split(position: Tensor, size: int) -> tuple[Tensor, Tensor]:
 def _base(shape: tuple[int, ...] | torch.Size, device: torch.device) -> Tensor:
     """First row of each image in the flattened table, (B, 1)."""
     return (torch.arange(shape[0], device=device) * (shape[1] * shape[2]))[:, None]
-
-
-def _read(table: Tensor, index: Tensor) -> Tensor:
-    rows = table.reshape(-1, table.shape[-1]).index_select(0, index.flatten())
-    return rows.view(*index.shape, table.shape[-1])

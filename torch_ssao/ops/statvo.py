@@ -54,12 +54,23 @@ class _Inputs(NamedTuple):
     slope: Tensor
 
 
+class _Tangents(NamedTuple):
+    """Tangents of `_Inputs`; None where there is none. Masks have none."""
+
+    points: Tensor | None
+    valid: Tensor | None
+    normal: Tensor | None
+    half: Tensor | None
+    box_height: Tensor | None
+    slope: Tensor | None
+
+
 class _Leaf(NamedTuple):
     """One layer as every window sees it; (B, N, ...) float64, N = H W."""
 
     member: Tensor  # (B, L, H, W) bool
     table: Tensor
-    count: Tensor
+    amount: Tensor  # n_i, in pixels
     mean: Tensor
     height: Tensor  # s, the mean height as a fraction of the box
     value: Tensor
@@ -79,8 +90,8 @@ class _StatVO(torch.autograd.Function):
         frame = _Frame(inputs)
         total = count = torch.zeros_like(frame.reach)
         for leaf in frame.leaves(labels, layers):
-            total = total + leaf.count * leaf.value
-            count = count + leaf.count
+            total = total + leaf.amount * leaf.value
+            count = count + leaf.amount
         obscurance = torch.where(frame.seen & (count > 0), total / count.clamp(min=MIN_COUNT), 0.0)
         return obscurance.view_as(points[:, 0, 0]).to(points.dtype), labels, count
 
@@ -105,7 +116,7 @@ class _StatVOWithJvp(_StatVO):
     def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[Tensor, None, None]:
         *inputs, obscurance, labels, count = ctx.saved_tensors
         frame = _Frame(_Inputs(*inputs))
-        tangent = frame.push_forward(_Inputs(*tangents[:6]), obscurance, labels, count, ctx.layers)
+        tangent = frame.push_forward(_Tangents(*tangents[:6]), obscurance, labels, count, ctx.layers)
         return tangent.view_as(obscurance).to(obscurance.dtype), None, None
 
 
@@ -166,13 +177,13 @@ class _Frame:
 
     def derivatives(self, leaf: _Leaf, obscurance: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
         """d VO / d (sums of this layer), (B, N, 4), and d VO / d rise, (B, N); zero where unseen or left out."""
-        kept = self.seen & (leaf.count > 0)
+        kept = self.seen & (leaf.amount > 0)
         safe = count.clamp(min=MIN_COUNT)
         per_rise = torch.where(kept, leaf.to_height / (safe * self.box_height), 0.0)
         to_count = torch.where(kept, (leaf.value - obscurance) / safe, 0.0) - per_rise * (leaf.mean * self.normal).sum(
             -1
         )
-        return torch.cat((per_rise[..., None] * self.normal, to_count[..., None]), -1), per_rise * leaf.count
+        return torch.cat((per_rise[..., None] * self.normal, to_count[..., None]), -1), per_rise * leaf.amount
 
     def pull_back(
         self, grad: Tensor, obscurance: Tensor, labels: Tensor, count: Tensor, layers: int
@@ -196,12 +207,13 @@ class _Frame:
             to_centre = to_centre - to_rise[..., None] * self.normal
             to_normal = to_normal + to_rise[..., None] * (leaf.mean - self.centre)
             to_box = to_box - (to_rise * leaf.height).sum(1)
-            weight = torch.where(self.seen, leaf.count / count.clamp(min=MIN_COUNT), 0.0)
+            weight = torch.where(self.seen, leaf.amount / count.clamp(min=MIN_COUNT), 0.0)
             to_slope = to_slope + (grad * weight * leaf.to_slope).sum(1)
         image_shape = self.inputs.normal.shape
         centre_image = to_centre.transpose(1, 2).reshape(image_shape)
         to_points = torch.cat((to_points[:, :, :1] + centre_image[:, :, None], to_points[:, :, 1:]), 2)
-        to_half = torch.cat((self._half_from_edges(to_edges)[:, :, None], torch.zeros_like(half[:, :, 1:]).double()), 2)
+        unused = torch.zeros_like(half[:, :, 1:], dtype=torch.float64)
+        to_half = torch.cat((self._half_from_edges(to_edges)[:, :, None], unused), 2)
         dtype = points.dtype
         return (
             to_points.to(dtype),
@@ -211,7 +223,9 @@ class _Frame:
             to_slope.to(dtype),
         )
 
-    def push_forward(self, tangents: _Inputs, obscurance: Tensor, labels: Tensor, count: Tensor, layers: int) -> Tensor:
+    def push_forward(
+        self, tangents: _Tangents, obscurance: Tensor, labels: Tensor, count: Tensor, layers: int
+    ) -> Tensor:
         """Tangent of the obscurance, (B, N); tangents that are None cost nothing."""
         obscurance = obscurance.double().flatten(1)
         edges = None if tangents.half is None else self._edges_from_half(tangents.half[:, :, 0].double())
@@ -232,7 +246,7 @@ class _Frame:
             if tangents.box_height is not None:
                 total = total - to_rise * leaf.height * tangents.box_height.double()[:, None]
             if tangents.slope is not None:
-                weight = torch.where(self.seen, leaf.count / count.clamp(min=MIN_COUNT), 0.0)
+                weight = torch.where(self.seen, leaf.amount / count.clamp(min=MIN_COUNT), 0.0)
                 total = total + weight * leaf.to_slope * tangents.slope.double()[:, None]
         return total
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import os
 import platform
 import subprocess
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
+from torch_ssao import checks
 
 _PACKAGES = ("torch", "numpy", "kornia", "trimesh", "embreex", "optimistix", "jax", "matplotlib")
 
@@ -19,8 +22,8 @@ def environment(device: torch.device | str = "cpu") -> dict[str, Any]:
 
     Args:
         device: the one the tensors lay on.
-    Returns: `commit` (None outside a git checkout of this package; "+dirty" is appended when files differ from it), `versions`,
-        `cpu`, `cpu_count` (cores this process may use), `threads` (of torch), `device`, `platform`.
+    Returns: `commit` (None outside a git checkout of this package; "+dirty" is appended when files differ from it),
+        `versions`, `cpu`, `cpu_count` (cores this process may use), `threads` (of torch), `device`, `platform`.
     """
     from torch_ssao import __version__
 
@@ -40,7 +43,7 @@ def environment(device: torch.device | str = "cpu") -> dict[str, Any]:
 
 
 def commit(folder: Path) -> str | None:
-    """The git commit that `folder`'s files belong to, with "+dirty" where they differ from it; None where there is none."""
+    """The git commit of `folder`'s files, with "+dirty" where they differ from it; None where there is none."""
     # A package installed into another project's checkout is not part of that project: ask whether git tracks it.
     if _git(folder, "ls-files", "--error-unmatch", "__init__.py") is None:
         return None
@@ -48,6 +51,14 @@ def commit(folder: Path) -> str | None:
     if not head:
         return None
     return head + ("+dirty" if _git(folder, "status", "--porcelain", "--", ".") else "")
+
+
+def require(caller: str, extra: str, *modules: str) -> None:
+    """Raise `MissingExtraError` unless all `modules`, installed by the extra `extra`, can be imported. Imports none."""
+    for module in modules:
+        if importlib.util.find_spec(module) is None:
+            remedy = f"run pip install 'torch_ssao[{extra}]'"
+            raise checks.MissingExtraError(f"{caller} needs {module}, which is not installed: {remedy}")
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

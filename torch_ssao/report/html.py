@@ -128,15 +128,18 @@ def _gallery(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
 
 
 def _values(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
-    head = ("model", "parameter", "value", "standard error", "meaning")
-    plot = _picture(pictures, "fitted_values.png", "Fitted values with standard errors; the dash is the start, hollow is undetermined.")
+    plot = _picture(
+        pictures,
+        "fitted_values.png",
+        "Fitted values with standard errors; the dash is the start, hollow is undetermined.",
+    )
     fits = [
         f"<li>{escape(row.label)}: {row.fit.evaluations} evaluations, {row.fit.steps} steps, {row.fit.seconds:.1f} s: "
         f"{escape(row.fit.message)}</li>"
         for row in measurement.rows
         if row.fit is not None
     ]
-    table = _table(head, tables.value_cells(measurement), text_columns=(1, 4))
+    table = _table(tables.VALUE_COLUMNS, tables.value_cells(measurement), text_columns=(1, 4))
     return f'<div class="plot">{plot}</div>{table}<ul class="soft">{"".join(fits)}</ul>'
 
 
@@ -154,7 +157,9 @@ def _conditions(measurement: Measurement) -> str:
         "commit": where["commit"] or "not in a git checkout",
         "platform": where["platform"],
     }
-    rows = "".join(f'<tr><td>{escape(key)}</td><td class="text">{escape(str(text))}</td></tr>' for key, text in facts.items())
+    rows = "".join(
+        f'<tr><td>{escape(key)}</td><td class="text">{escape(str(text))}</td></tr>' for key, text in facts.items()
+    )
     return f'<div class="scroll"><table>{rows}</table></div>'
 
 
@@ -163,7 +168,9 @@ def _table(
 ) -> str:
     lines = []
     for index, row in enumerate(rows):
-        cells = "".join(f'<td{" class=text" if i in text_columns else ""}>{escape(cell)}</td>' for i, cell in enumerate(row))
+        cells = "".join(
+            f"<td{' class=text' if i in text_columns else ''}>{escape(cell)}</td>" for i, cell in enumerate(row)
+        )
         lines.append(f"<tr{' class=best' if index == best else ''}>{cells}</tr>")
     top = "".join(f"<th>{escape(title)}</th>" for title in head)
     return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'

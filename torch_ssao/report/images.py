@@ -20,7 +20,7 @@ ERROR_SPAN = 0.5
 
 
 def grey_png(visibility: Tensor) -> bytes:
-    """PNG of a (H, W) or (1, H, W) image of visibility: linear 8-bit grey, round(255 visibility), no gamma; white is open.
+    """PNG of a (H, W) or (1, H, W) visibility: linear 8-bit grey, round(255 visibility), no gamma; white is open.
 
     Raises: ShapeError for more than one image.
     """
@@ -36,7 +36,7 @@ def grey_png(visibility: Tensor) -> bytes:
 
 
 def error_png(prediction: Tensor, target: Tensor, valid: Tensor) -> bytes:
-    """PNG of prediction - target, all (1, H, W): red too open, blue too dark, white right, grey where nothing is seen."""
+    """PNG of prediction - target, all (1, H, W): red too open, blue too dark, white right, grey sees nothing."""
     from matplotlib.figure import Figure
 
     error = np.where(_plane(valid) > 0, _plane(prediction) - _plane(target), np.nan)

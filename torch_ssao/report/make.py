@@ -2,40 +2,69 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from torch_ssao.report import html, images, plots
+from torch_ssao.report.environment import require
 from torch_ssao.report.measure import Measurement, measure, write_json
-from torch_ssao.report.rows import predict
+from torch_ssao.report.rows import REPEATS, predict
 
 if TYPE_CHECKING:
     from torch_ssao.scenes import Scene
 
 
-def make_report(scene: Scene, out: str | Path, **options: Any) -> Measurement:
+def make_report(
+    scene: Scene,
+    out: str | Path,
+    *,
+    views: Iterable[int] | None = None,
+    height: int = 360,
+    width: int = 480,
+    samples: int = 512,
+    fit_views: Iterable[int] = (0,),
+    layers: Sequence[int] = (1, 2, 4, 8),
+    technique: str = "statvo",
+    radius: float | None = None,
+    parameters: tuple[str, ...] | None = None,
+    repeats: int = REPEATS,
+    seed: int = 0,
+    progress: bool | None = None,
+) -> Measurement:
     """Measure a technique on a scene and write the report.
 
-    Args:
-        scene: from `scenes.builtin` or `scenes.load`.
-        out: folder, made where it is missing.
-        **options: every keyword of `measure`: views, height, width, samples, fit_views, layers, technique, radius, parameters,
-            repeats, seed, progress.
-    Returns: the `Measurement`; `files` names what was written to `out`: what `measure` writes, and report.html (self-contained),
-        speed_error.png, fitted_values.png, and for the first judged view reference.png and, for every model,
-        <name>_untuned.png, <name>_fitted.png and <name>_untuned_error.png, <name>_fitted_error.png. Grey pictures are
+    Args: those of `measure`.
+    Returns: the `Measurement`; `files` names what was written to `out`: what `measure` writes, and report.html
+        (self-contained), speed_error.png, fitted_values.png, and for the first judged view reference.png and, for every
+        model, <name>_untuned.png, <name>_fitted.png, <name>_untuned_error.png, <name>_fitted_error.png. Grey pictures are
         visibility in linear 8-bit grey, 255 = open.
     Raises: as `measure`, and MissingExtraError without the extra `report`, before any work.
     Cost: as `measure`, and about 0.3 s a picture.
     """
-    _check_installed()
-    measurement = measure(scene, out, **options)
+    require("make_report", "report", "matplotlib", "PIL")
+    measurement = measure(
+        scene,
+        out,
+        views=views,
+        height=height,
+        width=width,
+        samples=samples,
+        fit_views=fit_views,
+        layers=layers,
+        technique=technique,
+        radius=radius,
+        parameters=parameters,
+        repeats=repeats,
+        seed=seed,
+        progress=progress,
+    )
     pictures = draw(measurement)
     for name, content in pictures.items():
         images.write(measurement.out / name, content)
-    measurement = write_json(measurement, *pictures, "report.html")
-    images.write(measurement.out / "report.html", html.page(measurement, pictures).encode())
-    return measurement
+    page = html.page(measurement, pictures)
+    images.write(measurement.out / "report.html", page.encode())
+    return write_json(measurement, *pictures, "report.html")
 
 
 def draw(measurement: Measurement) -> dict[str, bytes]:
@@ -52,15 +81,3 @@ def draw(measurement: Measurement) -> dict[str, bytes]:
         pictures[f"{name}.png"] = images.grey_png(prediction)
         pictures[f"{name}_error.png"] = images.error_png(prediction, target, valid)
     return pictures
-
-
-def _check_installed() -> None:
-    import importlib.util
-
-    from torch_ssao import checks
-
-    for package, imported in (("matplotlib", "matplotlib"), ("pillow", "PIL")):
-        if importlib.util.find_spec(imported) is None:
-            raise checks.MissingExtraError(
-                f"make_report needs {package}, which is not installed: run pip install torch_ssao[report]"
-            )

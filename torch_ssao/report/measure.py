@@ -1,4 +1,4 @@
-"""The measurement behind `torch-ssao fit` and `torch-ssao report`: untuned and fitted modules against ray-traced references."""
+"""The measurement behind fit and report: untuned and fitted modules against ray-traced references."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch_ssao import checks, serialize
 from torch_ssao.gbuffer import GBuffer
 from torch_ssao.modules import AmbientVisibility
 from torch_ssao.report import rows as row_tools
-from torch_ssao.report.environment import environment
+from torch_ssao.report.environment import environment, require
 from torch_ssao.report.rows import FitSummary, Row, Score
 from torch_ssao.report.truth import CEILING_SEED_STEP, Ceiling, TraceSettings, Truth, noise_ceiling, trace_views
 
@@ -81,20 +81,22 @@ class Measurement:
     def as_dict(self) -> dict[str, Any]:
         """The measurement as plain values, as in report.json."""
         scene = {"name": self.scene.name, "faces": len(self.scene.faces), "fingerprint": self.scene.fingerprint}
-        return row_tools.plain({
-            "format": FORMAT,
-            "version": VERSION,
-            "scene": scene | {"views": len(self.scene.cameras), "suggested_radius": self.scene.radius},
-            "settings": asdict(self.settings),
-            "fit_views": self.fit_views,
-            "judged_views": self.judged_views,
-            "judged_on_training_views": self.judged_on_training_views,
-            "rows": [row.as_dict() for row in self.rows],
-            "constant": asdict(self.constant),
-            "ceiling": asdict(self.ceiling),
-            "environment": self.environment,
-            "files": self.files,
-        })
+        return row_tools.plain(
+            {
+                "format": FORMAT,
+                "version": VERSION,
+                "scene": scene | {"views": len(self.scene.cameras), "suggested_radius": self.scene.radius},
+                "settings": asdict(self.settings),
+                "fit_views": self.fit_views,
+                "judged_views": self.judged_views,
+                "judged_on_training_views": self.judged_on_training_views,
+                "rows": [row.as_dict() for row in self.rows],
+                "constant": asdict(self.constant),
+                "ceiling": asdict(self.ceiling),
+                "environment": self.environment,
+                "files": self.files,
+            }
+        )
 
 
 def measure(
@@ -118,12 +120,12 @@ def measure(
 
     Args:
         scene: from `scenes.builtin` or `scenes.load`.
-        out: folder, made where it is missing. Written: a reference per view (read back by the next run), each fitted module as
-            JSON as soon as it is fitted, report.json.
-        views: the views to judge on; None for all of the scene. Those used for fitting are left out, unless none remains: then the
-            fitted views are judged and marked as training views everywhere.
+        out: folder, made where it is missing. Written: a reference per view (read back by the next run), each fitted module
+            as JSON as soon as it is fitted, report.json.
+        views: the views to judge on; None for all of the scene. Those used for fitting are left out, unless none remains:
+            then the fitted views are judged and marked as training views everywhere.
         height, width: image size in pixels, at least 11 (the window of SSIM).
-        samples: rays a pixel of the reference.
+        samples: rays a pixel of the reference, a power of two.
         fit_views: the views to fit on.
         layers: layer counts, each once.
         technique: a name in `modules.TECHNIQUES`.
@@ -133,52 +135,39 @@ def measure(
         seed: of the reference's sampling pattern.
         progress: bars and notes on stderr; None shows them on a terminal only.
     Returns: a `Measurement`; its errors are of the judged views first and of the fitted views second.
-    Raises: RangeError, ChoiceError, SceneError for arguments that cannot be; MissingExtraError without the extras `scenes` and
-        `fitting`; OutputError before any work when `out` cannot be written.
+    Raises: RangeError, ChoiceError, SceneError for arguments that cannot be; MissingExtraError without the extras `scenes`
+        and `fitting`; OutputError before any work when `out` cannot be written.
     Cost: tracing dominates; see `reference.raytrace`. Judged views are traced twice, for the noise ceiling.
     """
-    from torch_ssao import fitting, scenes  # first of all: without the extras nothing should be traced
-
+    require("measure", "scenes", "trimesh", "embreex")  # before any work: without the extras nothing should be traced
+    require("measure", "fitting", "optimistix")
     settings = TraceSettings(height, width, scene.radius if radius is None else radius, samples, seed)
     modules = row_tools.candidates(technique, settings.radius, layers)
     fit_on, judged = _split_views(scene, views, fit_views)
-    _check_sizes(settings, repeats)
-    for _, _, module in modules:
-        _check_parameters(module, parameters)
+    _check_arguments(settings, repeats, modules[0][2], parameters)
     folder = checks.check_output_folder("out", out)
     note = _note(progress)
 
-    traced = sorted({*fit_on, *judged})
-    gbuffer = scenes.render(scene, views=traced, height=height, width=width)
-    truth = _visible_to_both(trace_views(scene, traced, settings, folder, progress=progress, note=note), gbuffer)
-    training, validation = ([traced.index(view) for view in chosen] for chosen in (fit_on, judged))
-    again = replace(settings, seed=seed + CEILING_SEED_STEP)
-    second = trace_views(scene, judged, again, folder, progress=progress, note=note)
-    ceiling = noise_ceiling(truth[validation], second)
-
-    fits: list[tuple[str, str, AmbientVisibility, FitSummary | None]] = [(*entry, None) for entry in modules]
-    files = []
-    for name, label, module in modules:
-        note(f"fitting {label}")
-        result = fitting.fit(
-            module, gbuffer[training], truth[training], parameters=parameters, valid=truth[training].valid, progress=progress
-        )
-        serialize.save(result.module, folder / f"{name}.json")
-        files.append(f"{name}.json")
-        fits.append((name, label, result.module, _summarise(result)))
-
+    data = _trace_all(scene, fit_on, judged, settings, folder, progress, note)
+    fits, files = _fit_all(modules, data, folder, parameters, progress, note)
     note("timing")
-    timings = row_tools.time_forward([fit[2] for fit in fits], gbuffer[validation[0]], repeats=repeats)
-    measured = []
-    for (name, label, module, summary), timing in zip(fits, timings, strict=True):
-        prediction = row_tools.predict(module, gbuffer)
-        errors = [row_tools.score(prediction[index], truth[index]) for index in (validation, training)]
-        measured.append(Row(name, label, module, errors[0], errors[1], timing, summary))
-    mean = row_tools.best_constant(truth[training])
-    errors = [row_tools.score_constant(mean, truth[index]) for index in (validation, training)]
+    measured = _judge(fits, data, repeats)
+    mean = row_tools.best_constant(data.truth[data.training])
+    judged_on = (data.validation, data.training)
+    constant = Constant(mean, *(row_tools.score_constant(mean, data.truth[rows]) for rows in judged_on))
     measurement = Measurement(
-        scene, folder, settings, tuple(fit_on), tuple(judged), tuple(measured), Constant(mean, errors[0], errors[1]), ceiling,
-        gbuffer[validation], truth[validation], environment(gbuffer.depth.device), tuple(files),
+        scene,
+        folder,
+        settings,
+        tuple(fit_on),
+        tuple(judged),
+        measured,
+        constant,
+        data.ceiling,
+        data.gbuffer[data.validation],
+        data.truth[data.validation],
+        environment(data.gbuffer.depth.device),
+        files,
     )
     return write_json(measurement)
 
@@ -194,6 +183,77 @@ def write_json(measurement: Measurement, *more_files: str) -> Measurement:
     return measurement
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class _Data:
+    """Every view that is fitted or judged, and which rows of the batch are which."""
+
+    gbuffer: GBuffer
+    truth: Truth
+    training: list[int]
+    validation: list[int]
+    ceiling: Ceiling
+
+
+def _trace_all(
+    scene: Scene,
+    fit_on: list[int],
+    judged: list[int],
+    settings: TraceSettings,
+    folder: Path,
+    progress: bool | None,
+    note: Callable[[str], None],
+) -> _Data:
+    from torch_ssao import scenes
+
+    traced = sorted({*fit_on, *judged})
+    gbuffer = scenes.render(scene, views=traced, height=settings.height, width=settings.width)
+    truth = trace_views(scene, traced, settings, folder, progress=progress, note=note)
+    # A pixel that the technique holds for empty is not its error: judge what both see.
+    truth = replace(truth, valid=truth.valid & gbuffer.valid_mask[:, :1].cpu())
+    training, validation = ([traced.index(view) for view in chosen] for chosen in (fit_on, judged))
+    again = replace(settings, seed=settings.seed + CEILING_SEED_STEP)
+    second = trace_views(scene, judged, again, folder, progress=progress, note=note)
+    return _Data(gbuffer, truth, training, validation, noise_ceiling(truth[validation], second))
+
+
+_Fit = tuple[str, str, AmbientVisibility, FitSummary | None]
+
+
+def _fit_all(
+    modules: list[tuple[str, str, AmbientVisibility]],
+    data: _Data,
+    folder: Path,
+    parameters: tuple[str, ...] | None,
+    progress: bool | None,
+    note: Callable[[str], None],
+) -> tuple[list[_Fit], tuple[str, ...]]:
+    """All modules untuned, then fitted; each fitted one is saved at once."""
+    from torch_ssao import fitting
+
+    gbuffer, truth = data.gbuffer[data.training], data.truth[data.training]
+    fitted: list[_Fit] = []
+    for name, label, module in modules:
+        note(f"fitting {label}")
+        result = fitting.fit(module, gbuffer, truth, parameters=parameters, valid=truth.valid, progress=progress)
+        serialize.save(result.module, folder / f"{name}.json")
+        fitted.append((name, label, result.module, _summarise(result)))
+    untuned: list[_Fit] = [(*entry, None) for entry in modules]
+    return untuned + fitted, tuple(f"{name}.json" for name, *_ in fitted)
+
+
+def _judge(fits: list[_Fit], data: _Data, repeats: int) -> tuple[Row, ...]:
+    timings = row_tools.time_forward([fit[2] for fit in fits], data.gbuffer[data.validation[0]], repeats=repeats)
+    measured = []
+    for (name, label, module, summary), timing in zip(fits, timings, strict=True):
+        prediction = row_tools.predict(module, data.gbuffer)
+        validation, training = (
+            row_tools.score(prediction[rows], data.truth[rows]) for rows in (data.validation, data.training)
+        )
+        measured.append(Row(name, label, module, validation, training, timing, summary))
+    return tuple(measured)
+
+
 def _split_views(scene: Scene, views: Iterable[int] | None, fit_views: Iterable[int]) -> tuple[list[int], list[int]]:
     """The views to fit on and the views to judge on, each once."""
     fit_on = list(dict.fromkeys(scene.view_indices(fit_views)))
@@ -201,29 +261,22 @@ def _split_views(scene: Scene, views: Iterable[int] | None, fit_views: Iterable[
     return fit_on, judged or fit_on
 
 
-def _check_sizes(settings: TraceSettings, repeats: int) -> None:
+def _check_arguments(
+    settings: TraceSettings, repeats: int, module: AmbientVisibility, parameters: tuple[str, ...] | None
+) -> None:
     checks.check_count("height", settings.height, SMALLEST)
     checks.check_count("width", settings.width, SMALLEST)
     checks.check_count("samples", settings.samples, 2)
     checks.check_count("repeats", repeats, 5)
-
-
-def _check_parameters(module: AmbientVisibility, parameters: tuple[str, ...] | None) -> None:
     for name in parameters or ():
         checks.check_choice("parameters", name, module.used_parameters())
 
 
-def _visible_to_both(truth: Truth, gbuffer: GBuffer) -> Truth:
-    """A pixel that the technique holds for empty is not its error: judge what both see."""
-    return replace(truth, valid=truth.valid & gbuffer.valid_mask[:, :1].cpu())
-
-
 def _summarise(result: Any) -> FitSummary:
-    return FitSummary(
-        dict(result.standard_errors), tuple(result.undetermined), result.steps, result.evaluations, result.seconds, result.message
-    )
+    errors, undetermined = dict(result.standard_errors), tuple(result.undetermined)
+    return FitSummary(errors, undetermined, result.steps, result.evaluations, result.seconds, result.message)
 
 
 def _note(progress: bool | None) -> Callable[[str], None]:
     shown = sys.stderr.isatty() if progress is None else progress
-    return (lambda text: print(text, file=sys.stderr, flush=True)) if shown else (lambda text: None)
+    return (lambda text: print(text, file=sys.stderr, flush=True)) if shown else (lambda text: None)  # noqa: T201

@@ -23,17 +23,30 @@ def speed_error_png(measurement: Measurement) -> bytes:
     for fitted, colour in ((False, UNTUNED), (True, FITTED)):
         rows = [row for row in measurement.rows if row.is_fitted == fitted]
         face = colour if fitted else "white"
-        low, middle, high = ([getattr(row.timing, f"{q}_ms") for row in rows] for q in ("low", "median", "high"))
-        spread = [[m - lo for m, lo in zip(middle, low, strict=True)], [hi - m for m, hi in zip(middle, high, strict=True)]]
+        times = [row.timing for row in rows]
+        middle = [time.median_ms for time in times]
+        spread = [[time.median_ms - time.low_ms for time in times], [time.high_ms - time.median_ms for time in times]]
         error = [row.validation.rmse for row in rows]
         axes.errorbar(
-            middle, error, xerr=spread, color=colour, marker="o", markersize=9, markerfacecolor=face, markeredgewidth=1.6,
-            linewidth=1.0, elinewidth=1.0, capsize=2, label="fitted" if fitted else "untuned", zorder=3,
+            middle,
+            error,
+            xerr=spread,
+            color=colour,
+            marker="o",
+            markersize=9,
+            markerfacecolor=face,
+            markeredgewidth=1.6,
+            linewidth=1.0,
+            elinewidth=1.0,
+            capsize=2,
+            label="fitted" if fitted else "untuned",
+            zorder=3,
         )
         for row, x, y in zip(rows, middle, error, strict=True):
             # Untuned labels above and fitted ones below: the two curves rarely cross.
             shift = (0, -16) if fitted else (0, 9)
-            axes.annotate(row.label, (x, y), xytext=shift, textcoords="offset points", ha="center", fontsize=8, color=colour)
+            style = {"ha": "center", "fontsize": 8, "color": colour}
+            axes.annotate(row.label, (x, y), xytext=shift, textcoords="offset points", **style)
     constant, ceiling = measurement.constant.validation.rmse, measurement.ceiling.rmse
     axes.axhline(constant, color="0.35", linestyle="--", linewidth=1.1, label=f"constant image, {constant:.3f}")
     axes.axhline(ceiling, color="0.35", linestyle=":", linewidth=1.3, label=f"noise of the reference, {ceiling:.4f}")
@@ -58,7 +71,7 @@ def _finish(axes: Any, measurement: Measurement) -> None:
 
 
 def fitted_values_png(measurement: Measurement) -> bytes | None:
-    """PNG of each parameter's fitted value and standard error by model, with its start; None when nothing was fitted."""
+    """PNG of each parameter's fitted value and standard error by model, with its start; None without any fit."""
     from matplotlib.figure import Figure
 
     fitted = [row for row in measurement.rows if row.fit is not None]
@@ -73,7 +86,13 @@ def fitted_values_png(measurement: Measurement) -> bytes | None:
             value, error = row.module.values()[name], _error(row, name)
             # Hollow: the views do not determine it, or it was not fitted.
             axes.errorbar(
-                x, value, yerr=error, marker="o", markersize=6, capsize=3, color=FITTED,
+                x,
+                value,
+                yerr=error,
+                marker="o",
+                markersize=6,
+                capsize=3,
+                color=FITTED,
                 markerfacecolor="white" if error is None else FITTED,
             )
             if row.name in start:

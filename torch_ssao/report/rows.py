@@ -111,7 +111,9 @@ def candidates(technique: str, radius: float, layers: Sequence[int]) -> list[tup
     if "layers" not in kind.CHOICES:
         return [(technique, technique, kind(radius))]
     if not layers or len(set(layers)) != len(layers):
-        raise checks.RangeError(f"layers must name layer counts, each once, got {tuple(layers)}: pass for example (1, 2, 4, 8)")
+        raise checks.RangeError(
+            f"layers must name layer counts, each once, got {tuple(layers)}: pass (1, 2, 4, 8) or so"
+        )
     plural = {count: "layer" if count == 1 else "layers" for count in layers}
     return [(f"{technique}_{n}", f"{n} {plural[n]}", kind(radius, layers=n)) for n in layers]
 
@@ -164,9 +166,9 @@ def time_forward(modules: Sequence[AmbientVisibility], gbuffer: GBuffer, *, repe
 
 
 def _summary(taken: list[float]) -> Timing:
-    low, median, high = torch.tensor(taken, dtype=torch.float64).quantile(
-        torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)
-    ).tolist()
+    low, median, high = (
+        torch.tensor(taken, dtype=torch.float64).quantile(torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)).tolist()
+    )
     return Timing(median, low, high, len(taken))
 
 

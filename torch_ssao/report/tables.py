@@ -13,10 +13,11 @@ if TYPE_CHECKING:
     from torch_ssao.report.measure import Measurement
 
 COLUMNS = ("model", "RMSE", "PSNR", "SSIM", "training RMSE", "PSNR", "SSIM", "ms a view (quartiles)")
+VALUE_COLUMNS = ("model", "parameter", "value", "standard error", "meaning")
 
 
 def score_cells(measurement: Measurement) -> list[list[str]]:
-    """Rows of the table of errors under `COLUMNS`: untuned and fitted modules by layer count, constant image, noise ceiling."""
+    """Rows of the table of errors under `COLUMNS`: untuned, then fitted modules, constant image, noise ceiling."""
     cells = [[_title(row), *_score(row.validation), *_score(row.training), _timing(row)] for row in measurement.rows]
     constant = f"constant {measurement.constant.value:.3f}"
     cells.append([constant, *_score(measurement.constant.validation), *_score(measurement.constant.training), ""])
@@ -38,11 +39,12 @@ def value_cells(measurement: Measurement) -> list[list[str]]:
 def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Columns padded to equal width; the first is flush left, the others flush right."""
     widths = [max(len(line[i]) for line in (head, *rows)) for i in range(len(head))]
-    lines = [
-        "  ".join(cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(line, widths, strict=True)))
-        for line in (head, ["-" * w for w in widths], *rows)
-    ]
-    return "\n".join(line.rstrip() for line in lines)
+    lines = []
+    for line in (head, ["-" * width for width in widths], *rows):
+        padded = [cell.rjust(width) for cell, width in zip(line, widths, strict=True)]
+        padded[0] = line[0].ljust(widths[0])
+        lines.append("  ".join(padded).rstrip())
+    return "\n".join(lines)
 
 
 def number(value: float, digits: int) -> str:

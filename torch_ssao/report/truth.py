@@ -5,21 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
-import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torch_ssao import metrics
 
 if TYPE_CHECKING:
+    from torch_ssao.reference import Reference
     from torch_ssao.scenes import Scene
 
 CEILING_SEED_STEP = 1
@@ -52,7 +49,10 @@ class TraceSettings:
     """What a reference depends on besides the mesh and the view.
 
     Args:
-        height, width: pixels. radius: scene units. samples: rays a pixel. seed: of the sampling pattern. falloff: see `raytrace`.
+        height, width: pixels.
+        radius: scene units.
+        samples: rays a pixel, a power of two.
+        seed, falloff: see `reference.raytrace`.
     """
 
     height: int
@@ -72,7 +72,7 @@ class Ceiling:
         rmse: root of the mean squared standard error over the judged pixels.
         psnr: -20 log10(rmse).
         ssim: 1 - (1 - ssim_pair) / 2: only one of the two pictures compared is noisy.
-        rmse_pair: RMSE between two independent references of the same sample count, divided by sqrt(2); should equal `rmse`.
+        rmse_pair: RMSE between two independent references of the same sample count, divided by sqrt(2): a check of `rmse`.
         ssim_pair: SSIM between these two, a lower bound of the ceiling.
     """
 
@@ -98,24 +98,27 @@ def trace_views(
         scene: what is traced.
         views: indices into `scene.cameras`; the batch follows their order.
         settings: size, radius, samples, seed and falloff.
-        folder: where `reference_<view>_<fingerprint>.npz` are read and written, one a view, each in one step: an interrupted run
-            keeps what it finished. The fingerprint covers mesh, views, settings and the package's version. A file that is
-            truncated, foreign or made for something else is traced again and replaced.
+        folder: where `reference_<view>_<fingerprint>.npz` are read and written, one a view: an interrupted run keeps what
+            it finished. The fingerprint covers mesh, views, settings and the package's version. A file that is truncated,
+            foreign or made for something else is traced again and replaced.
         progress: bar of the tracer; None shows it on a terminal only.
         note: called with one line before each view that has to be traced.
     Raises: as `reference.raytrace`.
     """
+    from torch_ssao import reference
+
     kept: list[Truth] = []
     for view in views:
-        key = _fingerprint(scene, view, settings)
-        path = folder / f"reference_{view}_{key[:16]}.npz"
-        truth = _read(path, key, settings)
+        path = folder / f"reference_{view}_{_fingerprint(scene, view, settings)}.npz"
+        truth = _read(path, scene, view, settings)
         if truth is None:
-            note(f"tracing view {view} with {settings.samples} rays a pixel")
-            truth = _trace(scene, view, settings, progress)
-            _write(path, key, truth)
+            note(f"tracing view {view} with {settings.samples} rays a pixel, seed {settings.seed}")
+            traced = reference.raytrace(scene, views=[view], progress=progress, **asdict(settings))
+            reference.save(traced, path)
+            truth = _truth(traced)
         kept.append(truth)
-    return Truth(*(torch.cat([getattr(truth, name) for truth in kept]) for name in ("visibility", "standard_error", "valid")))
+    images = ("visibility", "standard_error", "valid")
+    return Truth(*(torch.cat([getattr(truth, name) for truth in kept]) for name in images))
 
 
 def noise_ceiling(first: Truth, second: Truth) -> Ceiling:
@@ -123,8 +126,9 @@ def noise_ceiling(first: Truth, second: Truth) -> Ceiling:
 
     Args:
         first, second: references of the same views and sample count with different seeds.
-    Returns: see `Ceiling`. With reference = truth + noise of standard error s, a perfect model's RMSE is sqrt(mean(s^2)). Two
-        references differ by twice that variance, and for small noise 1 - SSIM is proportional to the variance, hence the halving.
+    Returns: see `Ceiling`. With reference = truth + noise of standard error s, a perfect model's RMSE is sqrt(mean(s^2)).
+        Two references differ by twice that variance, and for small noise 1 - SSIM is proportional to the variance: hence
+        the halving.
     """
     valid = first.valid & second.valid
     rmse = float(first.standard_error[first.valid].double().square().mean().sqrt())
@@ -134,42 +138,29 @@ def noise_ceiling(first: Truth, second: Truth) -> Ceiling:
     return Ceiling(rmse, psnr, 1 - (1 - ssim) / 2, pair / math.sqrt(2), ssim)
 
 
-def _trace(scene: Scene, view: int, settings: TraceSettings, progress: bool | None) -> Truth:
-    from torch_ssao import reference
-
-    traced = reference.raytrace(scene, views=[view], progress=progress, **asdict(settings))
-    return Truth(traced.visibility.float(), traced.standard_error.float(), traced.valid)
-
-
 def _fingerprint(scene: Scene, view: int, settings: TraceSettings) -> str:
     from torch_ssao import __version__
 
     parts: dict[str, Any] = {"scene": scene.fingerprint, "view": view, "version": __version__, **asdict(settings)}
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _read(path: Path, key: str, settings: TraceSettings) -> Truth | None:
+def _read(path: Path, scene: Scene, view: int, settings: TraceSettings) -> Truth | None:
     """The reference in `path`, or None where there is none that can be trusted."""
+    from torch_ssao import reference
+
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            if str(stored["fingerprint"]) != key:
-                return None
-            arrays = [stored[name] for name in ("visibility", "standard_error", "valid")]
-    except (OSError, EOFError, KeyError, ValueError, TypeError, zipfile.BadZipFile, zlib.error):
+        stored = reference.load(path)
+    except ValueError:  # missing, truncated or something else
         return None
-    shape = (1, 1, settings.height, settings.width)
-    dtypes = (np.float32, np.float32, np.bool_)
-    if any(array.shape != shape or array.dtype != dtype for array, dtype in zip(arrays, dtypes, strict=True)):
-        return None
-    return Truth(*(torch.from_numpy(array) for array in arrays))
+    facts = (stored.fingerprint, stored.views, tuple(stored.visibility.shape[2:]), *_traced_with(stored))
+    wanted = (scene.fingerprint, (view,), (settings.height, settings.width), *_traced_with(settings))
+    return _truth(stored) if facts == wanted else None
 
 
-def _write(path: Path, key: str, truth: Truth) -> None:
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    arrays = {name: getattr(truth, name).numpy() for name in ("visibility", "standard_error", "valid")}
-    try:
-        with partial.open("wb") as file:
-            np.savez_compressed(file, fingerprint=np.array(key), **arrays)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+def _traced_with(facts: Reference | TraceSettings) -> tuple[float, int, int, str]:
+    return float(facts.radius), facts.samples, facts.seed, facts.falloff
+
+
+def _truth(traced: Reference) -> Truth:
+    return Truth(traced.visibility, traced.standard_error, traced.valid)

@@ -132,12 +132,12 @@ def _is_interior(corners: NDArray[Any], rays: RayCaster, size: float) -> bool:
 
 
 def _inside(low: Float64, high: Float64, rays: RayCaster) -> list[View]:
-    """Places with room around them, towards the longest free way, away from one another."""
+    """Places with room around them, towards where much is seen and far, away from one another."""
     diagonal = float(np.linalg.norm(high - low))
     axes = [low[i] + (high[i] - low[i]) * np.linspace(0.06, 0.94, n) for i, n in enumerate((9, 7, 9))]
     eyes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     around = sphere_directions(96)
-    reach = _cast(eyes, around, rays)  # (N, 96), inf for none
+    reach, _ = _cast(eyes, around, rays)  # (N, 96), inf for none
     enclosed = np.isfinite(reach).mean(axis=1) >= 0.8
     roomy = reach.min(axis=1) >= 0.015 * diagonal
     eyes = eyes[enclosed & roomy]
@@ -148,10 +148,10 @@ def _inside(low: Float64, high: Float64, rays: RayCaster) -> list[View]:
         if len(eyes) == 0:
             break
         frustum = _frustum(View((0.0, 0.0, 0.0), tuple(direction), _UP, _INSIDE_FOV), 6, 8)
-        seen = _cast(eyes, frustum / np.linalg.norm(frustum, axis=1, keepdims=True), rays)
+        seen, detail = _cast(eyes, frustum / np.linalg.norm(frustum, axis=1, keepdims=True), rays)
         covered = np.isfinite(seen).mean(axis=1)
         near = np.where(np.isfinite(seen), seen, np.inf).min(axis=1)
-        score = np.log(np.where(np.isfinite(seen), seen, 0.02 * diagonal) / diagonal + 1e-3).mean(axis=1)
+        score = np.log(np.where(np.isfinite(seen), seen, 0.02 * diagonal) / diagonal + 1e-3).mean(axis=1) + np.log(detail)
         score = np.where((covered >= 0.9) & (near >= 0.02 * diagonal), score, -np.inf)
         candidates += [(float(s), i, j) for i, s in enumerate(score) if np.isfinite(s)]
     candidates.sort(key=lambda c: (-c[0], c[1], c[2]))
@@ -174,7 +174,7 @@ def _outside(middle: Float64, size: float, rays: RayCaster) -> list[View]:
         a, e = np.deg2rad(azimuth), np.deg2rad(elevation)
         outwards = np.array([np.cos(e) * np.cos(a), np.sin(e), np.cos(e) * np.sin(a)])
         best, best_share = None, 0.0
-        for factor in (0.9, 1.2, 0.7, 1.6):
+        for factor in (0.9, 0.65, 1.2, 1.6):
             eye = middle + factor * reach * outwards
             view = View(tuple(eye), tuple(middle), _UP, _OUTSIDE_FOV)
             distance = rays.first_hit(eye, _frustum(view, 12, 16))[1]
@@ -183,7 +183,7 @@ def _outside(middle: Float64, size: float, rays: RayCaster) -> list[View]:
             share = float(seen.mean()) * (0.3 if (distance * length < 0.15 * reach).mean() > 0.1 else 1.0)
             if share > best_share:
                 best, best_share = view, share
-            if share >= 0.25:
+            if share >= 0.45:
                 break
         if best is not None:
             views.append(best)
@@ -199,10 +199,12 @@ def sphere_directions(count: int) -> Float64:
     return np.stack((r * np.cos(angle), y, r * np.sin(angle)), axis=1)
 
 
-def _cast(eyes: Float64, directions: Float64, rays: RayCaster) -> Float64:
-    """(N, M) distances along every direction from every eye, inf for none."""
+def _cast(eyes: Float64, directions: Float64, rays: RayCaster) -> tuple[Float64, Int64]:
+    """(N, M) distances along every direction from every eye, inf for none; (N,) how many different triangles are hit, at least 1."""
     origins = np.repeat(eyes, len(directions), axis=0)
-    return rays.first_hit(origins, np.tile(directions, (len(eyes), 1)))[1].reshape(len(eyes), -1)
+    triangle, distance = rays.first_hit(origins, np.tile(directions, (len(eyes), 1)))
+    ordered = np.sort(triangle.reshape(len(eyes), -1), axis=1)
+    return distance.reshape(len(eyes), -1), 1 + (np.diff(ordered, axis=1) != 0).sum(axis=1)
 
 
 def _frustum(view: View, height: int, width: int) -> Float64:

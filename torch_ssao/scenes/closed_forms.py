@@ -176,7 +176,7 @@ def raised_slat(
     """Visibility on a floor at `distance` from an infinitely long thin wall that begins at `gap` and is `height` high.
 
     With d1, d2 the distances to the lower and the upper edge, occlusion is (x / pi) (S(d1 / R) / d1 - S(d2 / R) / d2), S the
-    numerators of `wall`; infinite radius: (x / d1 - x / d2) / 2. Uniform, binary: (P(gap / d1) - P((gap + height) / d2)) / -pi with
+    numerators of `wall`; infinite radius: (x / d1 - x / d2) / 2. Uniform, binary: (P((gap + height) / d2) - P(gap / d1)) / pi with
     P(w) = asin(w / q) - s atan(s w / sqrt(q^2 - w^2)), s = x / R, q^2 = 1 - s^2, w at most q; other uniform falloffs by quadrature.
 
     Args:
@@ -252,8 +252,8 @@ def sphere_on_plane(
 ) -> Array:
     """Visibility on a floor at `lateral` from the contact point of a sphere that rests on it.
 
-    Infinite radius: 1 - (1 + (x / r)^2)^(-3/2); uniform 1 - x / sqrt(x^2 + r^2) is the occlusion. Finite: as `sphere`, always
-    above the horizon; falloffs other than binary by quadrature.
+    Infinite radius: 1 - (1 + (x / r)^2)^(-3/2); uniform x / sqrt(x^2 + r^2). Finite: as `sphere`, always above the horizon;
+    falloffs other than binary by quadrature.
 
     Args:
         lateral: x >= 0; sphere_radius: r > 0; scene units.

@@ -95,13 +95,15 @@ def heap() -> Parts:
     for i in range(46):
         ring = i % 3 == 0
         size = float(rng.uniform(0.3, 0.5) if ring else rng.uniform(0.16, 0.42))
-        x, z = rng.normal(0.0, 0.85, 2)
-        center = np.array([x, _rest_height(placed, x, z, size * (0.55 if ring else 1.0)), z])
+        body = size * (0.55 if ring else 1.0)
+        drops = [(_rest_height(placed, x, z, body), x, z) for x, z in rng.normal(0.0, 0.8, (10, 2))]
+        y, x, z = min(drops)  # the lowest of ten places: a heap, not a tower
+        center = np.array([x, y, z])
         if ring:
             b.torus(center, size * 0.75, size * 0.25, _tilt(rng))
         else:
             b.sphere(center, size)
-        placed.append((center, size * (0.55 if ring else 1.0)))
+        placed.append((center, body))
     for angle in np.arange(0.0, 360.0, 30.0):  # a few strays round the heap
         far = float(rng.uniform(2.4, 3.6))
         size = float(rng.uniform(0.12, 0.3))
@@ -114,7 +116,7 @@ def heap() -> Parts:
         View((3.6, 2.3, 3.9), (0.0, 0.55, 0.0), fov_y_deg=45.0),
         View((-3.4, 1.0, 2.6), (0.1, 0.6, 0.0), fov_y_deg=45.0),
         View((0.6, 3.9, -3.2), (0.0, 0.5, 0.1), fov_y_deg=45.0),
-        View((1.6, 1.0, -3.3), (-0.1, 0.7, 0.0), fov_y_deg=35.0),
+        View((2.9, 1.3, -3.6), (0.0, 0.4, 0.0), fov_y_deg=38.0),
     )
     return b, views, 0.4
 
