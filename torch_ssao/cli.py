@@ -39,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Args:
         argv: arguments after the program's name; None takes those of the process.
-    Returns: exit status: 0, 2 after an error told in one line on stderr, 130 after Ctrl-C. Files that were finished stay.
+    Returns: exit status: 0; 2 after an error, told in one line on stderr; 130 after Ctrl-C. Finished files stay.
     """
     try:
         arguments = _parser().parse_args(argv)
@@ -57,6 +57,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"torch-ssao: error: {_one_line(error)}", file=sys.stderr)
         return 2
     return 0
+
+
+def run() -> NoReturn:
+    """`main` as the installed command: ends the process with its exit status."""
+    sys.exit(main())
 
 
 def scenes_command(arguments: argparse.Namespace) -> None:
@@ -147,14 +152,14 @@ def _tell(measurement: Measurement, file: str) -> None:
     settings = measurement.settings
     fitted_on = ", ".join(map(str, measurement.fit_views))
     print(
-        f"{measurement.scene.name}, {settings.width}x{settings.height}, radius {settings.radius:g}, {settings.samples} rays a pixel; "
-        f"fitted on view {fitted_on}, judged on {measurement.judged_label}"
+        f"{measurement.scene.name}, {settings.width}x{settings.height}, radius {settings.radius:g}, "
+        f"{settings.samples} rays a pixel; fitted on view {fitted_on}, judged on {measurement.judged_label}"
     )
     if measurement.judged_on_training_views:
         print("no view was left that the fit had not seen: the errors of the fitted models flatter them")
     print(tables.text_table(tables.COLUMNS, tables.score_cells(measurement)))
     print()
-    print(tables.text_table(tables.VALUE_COLUMNS, tables.value_cells(measurement)))
+    print(tables.text_table(*tables.value_matrix(measurement)))
     print(f"\nwrote {measurement.out / file}")
 
 
@@ -202,12 +207,10 @@ def _progress(arguments: argparse.Namespace) -> bool | None:
 
 
 def _is_for_the_caller(error: Exception) -> bool:
-    """Whether an error was raised to be read by a person; a ValueError from elsewhere is a bug and keeps its traceback."""
-    if isinstance(error, ValueError):
-        return type(error).__module__.startswith("torch_ssao.") or isinstance(error, CommandLineError)
-    if isinstance(error, ImportError):
-        return _extra(error) is not None
-    return True
+    """Whether an error is meant for a person; another package's ValueError is a bug and keeps its traceback."""
+    if type(error).__module__.startswith("torch_ssao."):
+        return True
+    return _extra(error) is not None if isinstance(error, ImportError) else isinstance(error, OSError)
 
 
 def _extra(error: ImportError) -> str | None:
@@ -216,7 +219,7 @@ def _extra(error: ImportError) -> str | None:
 
 
 def _one_line(error: Exception) -> str:
-    if isinstance(error, ImportError):
+    if isinstance(error, ImportError) and _extra(error):
         return f"{error.name} is not installed: run pip install 'torch_ssao[{_extra(error)}]'"
     return " ".join(str(error).split()) or type(error).__name__
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from support import monte_carlo as mc
 
+from support import monte_carlo as mc
 from torch_ssao import checks
 from torch_ssao.camera import Camera, look_at
 from torch_ssao.gbuffer import GBuffer
@@ -155,7 +155,8 @@ def test_known_answers_per_pixel() -> None:
     scene = analytic.wall()
     gbuffer = scene.render(scene.camera(*SIZE))
     visibility, known = scene.exact(gbuffer)
-    assert bool(known.all()) and torch.allclose(visibility, torch.tensor(0.5, dtype=torch.float64), atol=1e-12)
+    assert bool(known.all())
+    assert torch.allclose(visibility, torch.tensor(0.5, dtype=torch.float64), atol=1e-12)
     visibility, _ = scene.exact(gbuffer, radius=0.5)
     points = _points(gbuffer)
     expected = cf.wall(np.maximum(np.abs(points[..., 0]), np.abs(points[..., 2])), radius=0.5)
@@ -173,11 +174,11 @@ def test_other_sides_are_known() -> None:
         scene = BUILDERS[name]()
         visibility, known = scene.exact(scene.render(camera))
         assert bool(known.all()) and bool((visibility == 1).all()), name
-    # From below the floor half-plane of a wedge one stands in the outer angle of 360 - 310 = 50 degrees.
-    outside = analytic.dihedral(310.0)
+    # From below the floor half-plane of a wedge one stands in the outer angle of 360 - 275 = 85 degrees.
+    outside = analytic.dihedral(275.0)
     visibility, known = outside.exact(outside.render(camera))
     assert bool(known.any())
-    inner = math.sin(math.radians(25.0)) ** 2
+    inner = math.sin(math.radians(42.5)) ** 2
     assert torch.allclose(visibility[known], torch.tensor(inner, dtype=torch.float64), atol=1e-12)
 
 
@@ -189,19 +190,22 @@ def test_unknown_where_no_closed_form_holds() -> None:
     gbuffer = scene.render(camera)
     assert torch.allclose(gbuffer.depth[0, 0, 3, 3], torch.tensor(1.0, dtype=torch.float64), atol=0.02)
     visibility, known = scene.exact(gbuffer)
-    assert not bool(known.any()) and bool((visibility == 1).all())
+    assert not bool(known.any())
+    assert bool((visibility == 1).all())
 
     slat = analytic.raised_slat(0.2, 0.4)
     gbuffer = slat.render(slat.camera(*SIZE))
     _, known = slat.exact(gbuffer, radius=0.5, weighting="volumetric")
     on_floor = np.abs(_points(gbuffer)[..., 2]) < 1e-9
-    assert on_floor.any() and (~on_floor).any()
+    assert on_floor.any()
+    assert (~on_floor).any()
     np.testing.assert_array_equal(known[0, 0].numpy(), ~on_floor)
 
     wall = analytic.wall()
     gbuffer = wall.render(wall.camera(*SIZE))
     visibility, known = wall.exact(gbuffer, radius=0.5, weighting="volumetric")
-    assert bool(known.all()) and 0.5 <= visibility.min().item() < 0.6
+    assert bool(known.all())
+    assert 0.5 <= visibility.min().item() < 0.6
 
     moved = GBuffer(gbuffer.depth * 0.9, gbuffer.camera)
     assert not bool(wall.exact(moved)[1].any())
@@ -211,22 +215,26 @@ def test_rays_that_miss_are_invalid() -> None:
     scene = analytic.plane()
     gbuffer = scene.render(scene.camera(16, 16, view_angle_deg=85.0, fov_y_deg=60.0))
     valid = gbuffer.valid_mask[0, 0]
-    assert bool(valid[-1].all()) and not bool(valid[0].any())
+    assert bool(valid[-1].all())
+    assert not bool(valid[0].any())
     assert bool(torch.isinf(gbuffer.depth[0, 0][~valid]).all())
     assert gbuffer.normal is not None
     assert bool((gbuffer.normal[0, :, 0, 0] == torch.tensor([0.0, 0.0, -1.0])).all())
     assert gbuffer.depth[0, 0][valid].max().item() <= 1e4 * scene.span
     visibility, known = scene.exact(gbuffer, radius=1.0)
-    assert torch.equal(known[0, 0], valid) and bool((visibility == 1).all())
+    assert torch.equal(known[0, 0], valid)
+    assert bool((visibility == 1).all())
 
 
 def test_batches_dtypes_and_cameras_without_pose() -> None:
     scene = analytic.ceiling(1.0)
     both = Camera.cat([scene.camera(*SIZE, view_angle_deg=a) for a in (10.0, 60.0)])
     gbuffer = scene.render(both, dtype=torch.float32)
-    assert gbuffer.depth.shape == (2, 1, *SIZE) and gbuffer.depth.dtype == torch.float32
+    assert gbuffer.depth.shape == (2, 1, *SIZE)
+    assert gbuffer.depth.dtype == torch.float32
     visibility, known = scene.exact(gbuffer, radius=2.0)
-    assert visibility.dtype == torch.float32 and bool(known.all())
+    assert visibility.dtype == torch.float32
+    assert bool(known.all())
     assert torch.allclose(visibility, torch.tensor(0.25), atol=1e-6)
     single = scene.render(both[1], dtype=torch.float32)
     assert torch.equal(single.depth, gbuffer.depth[1:])
@@ -248,8 +256,10 @@ def test_float32_depth_is_still_on_its_surface() -> None:
 def test_mesh_is_the_scene(name: str) -> None:
     scene = BUILDERS[name]()
     vertices, faces = scene.mesh(3.0)
-    assert vertices.dtype == np.float64 and faces.dtype == np.int64
-    assert faces.min() == 0 and faces.max() == len(vertices) - 1
+    assert vertices.dtype == np.float64
+    assert faces.dtype == np.int64
+    assert faces.min() == 0
+    assert faces.max() == len(vertices) - 1
     corners = vertices[faces]
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     assert (area > 0).all()

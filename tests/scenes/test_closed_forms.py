@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import monte_carlo as mc
 
+from support import monte_carlo as mc
 from torch_ssao import checks
 from torch_ssao.scenes import closed_forms as cf
 
@@ -80,7 +80,7 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[float, ...], tuple[float, ...],
 }
 
 
-@pytest.mark.parametrize("falloff, weighting", ASKED)
+@pytest.mark.parametrize(("falloff", "weighting"), ASKED)
 @pytest.mark.parametrize("radius", RADII)
 @pytest.mark.parametrize("case", CASES)
 def test_closed_form_against_ray_casting(case: str, radius: float, falloff: str, weighting: str) -> None:
@@ -120,7 +120,7 @@ def test_textbook_values() -> None:
     assert cf.dihedral(0.0, 70.0, radius=1.0, weighting="volumetric") == pytest.approx(70 / 180, abs=1e-13)
 
 
-@pytest.mark.parametrize("falloff, weighting", [*ASKED, ("binary", "volumetric")])
+@pytest.mark.parametrize(("falloff", "weighting"), [*ASKED, ("binary", "volumetric")])
 def test_special_cases_agree_with_general_forms(falloff: str, weighting: str) -> None:
     """Closed falloffs of wall and ceiling against the quadrature, over eight decades of distance."""
     s = np.array([0.0, 1e-8, 1e-4, 1e-2, 0.1, 0.5, 0.9, 0.999, 1.0, 3.0])
@@ -139,7 +139,7 @@ def test_special_cases_agree_with_general_forms(falloff: str, weighting: str) ->
         np.testing.assert_allclose(tilted, cf.sphere_on_plane(x, r, **asked), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("falloff, weighting", ASKED)
+@pytest.mark.parametrize(("falloff", "weighting"), ASKED)
 def test_bounds_monotone_and_scale_free(falloff: str, weighting: str) -> None:
     x = np.linspace(0.0, 2.0, 41)
     forms: list[Callable[..., Any]] = [

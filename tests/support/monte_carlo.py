@@ -77,7 +77,7 @@ def free_volume(
     *,
     radius: float,
     seed: int = 0,
-    log2_points: int = LOG2_RAYS,
+    log2_points: int = 19,
 ) -> float:
     """Share of the half-ball about `origin` whose points (N, 3) `solid` does not contain."""
     u = qmc.Sobol(3, scramble=True, rng=np.random.default_rng(seed)).random_base2(log2_points)

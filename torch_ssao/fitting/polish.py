@@ -18,10 +18,11 @@ LAST = 2e-5  # differences below this change nothing that a fit is judged by
 WORTH = 1e-5  # relative gain of a round below which the difference is shortened
 
 
-def polish(residuals: Residuals, space: ParameterSpace, *, first: float = FIRST) -> int:
-    """Refine the best point of `residuals` in place; return the number of steps that helped.
+def polish(residuals: Residuals, space: ParameterSpace, *, first: float = FIRST) -> tuple[int, bool]:
+    """Refine the best point of `residuals` in place.
 
     Each round takes P differences around the best point, downhill where that is known, and the damped Gauss-Newton step from them.
+    Returns: the number of rounds that helped; whether the differences became as short as `LAST` (else the budget ended it).
     Cost: P + 1 evaluations a round, until the budget or `LAST` is reached.
     """
     size, steps, delta = len(space), 0, first
@@ -46,7 +47,7 @@ def polish(residuals: Residuals, space: ParameterSpace, *, first: float = FIRST)
             delta = min(delta, max(length, delta / 8)) * (0.5 if gained else 0.25)
     except BudgetSpent:
         pass
-    return steps
+    return steps, delta <= LAST
 
 
 def _best(residuals: Residuals) -> tuple[Tensor, Tensor]:

@@ -26,7 +26,7 @@ class Residuals:
         target: (B, 1, H, W) visibility.
         weight: (B, 1, H, W) >= 0 that sum to 1; pixels of weight 0 never enter.
         names: the P parameters.
-        budget: evaluations allowed in all; a residual counts 1, a Jacobian P more.
+        budget: evaluations allowed in all; residuals count 1, a Jacobian counts P.
         on_evaluation: called with the number of evaluations just done.
     Cost: one view at a time; kept are N-vectors of the N pixels that count, float64, on the module's device.
     """
@@ -73,19 +73,17 @@ class Residuals:
             ]
         return self._seen(log, torch.cat(parts))
 
-    def value_and_jacobian(self, log: Tensor) -> tuple[Tensor, Tensor]:
-        """(N,) residuals and (N, P) derivatives to the logarithms. P + 1 evaluations. Raises: BudgetSpent.
+    def jacobian(self, log: Tensor) -> Tensor:
+        """(N, P) derivatives of the residuals to the logarithms. P evaluations. Raises: BudgetSpent.
 
-        Forward mode with the tangents as a vmapped batch: the primal is computed once for all columns.
+        Forward mode with the tangents as a vmapped batch: the primal is computed once for all columns, one view at a time.
         """
-        self._spend(1 + len(self.names))
-        values, columns = [], []
+        self._spend(len(self.names))
+        columns = []
         with torch.no_grad():
-            for gbuffer, inside, wanted, root in self._views:
-                prediction, tangents = self._push_forward(gbuffer, log)
-                values.append((prediction[inside].double() - wanted) * root)
-                columns.append(tangents[:, inside].double().T * root[:, None])
-        return self._seen(log, torch.cat(values)), torch.cat(columns)
+            for gbuffer, inside, _, root in self._views:
+                columns.append(self._push_forward(gbuffer, log)[:, inside].double().T * root[:, None])
+        return torch.cat(columns)
 
     def per_view(self, columns: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Split rows of N pixels into (mask (H, W), rows) of each view."""
@@ -98,13 +96,14 @@ class Residuals:
         state = {f"raw_{name}": raw[i] for i, name in enumerate(self.names)}
         return torch.func.functional_call(self.module, state, (gbuffer,))[0, 0]
 
-    def _push_forward(self, gbuffer: GBuffer, log: Tensor) -> tuple[Tensor, Tensor]:
-        def column(direction: Tensor) -> tuple[Tensor, Tensor]:
-            return torch.func.jvp(lambda at: self._predict(gbuffer, at), (log,), (direction,))
+    def _push_forward(self, gbuffer: GBuffer, log: Tensor) -> Tensor:
+        """(P, H, W) tangents of the visibility."""
 
-        basis = torch.eye(len(self.names), dtype=log.dtype)
-        prediction, tangents = torch.func.vmap(column, out_dims=(None, 0))(basis)
-        return prediction, tangents
+        def column(direction: Tensor) -> Tensor:
+            _, tangent = torch.func.jvp(lambda at: self._predict(gbuffer, at), (log,), (direction,))
+            return tangent  # type: ignore[no-any-return]
+
+        return torch.func.vmap(column)(torch.eye(len(self.names), dtype=log.dtype))
 
     def _spend(self, count: int) -> None:
         if count > self.left:

@@ -22,12 +22,14 @@ body { margin: 0 auto; max-width: 70rem; padding: 1.2rem; font: 16px/1.5 system-
 h1 { font-size: 1.5rem; margin: .4rem 0; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
 p, li { max-width: 46rem; } .soft, figcaption { color: var(--soft); font-size: .9rem; }
 .warning { border-left: 4px solid #c9821b; padding: .4rem .8rem; background: var(--shade); }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
 th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; } td.text { text-align: left; white-space: normal; }
 tr.best { background: var(--shade); font-weight: 600; }
 figure { margin: 0; } img { width: 100%; height: auto; display: block; background: #fff; }
-.plot { max-width: 46rem; } .grid { display: grid; gap: .8rem; grid-template-columns: repeat(auto-fit, minmax(15rem, 1fr)); }
+.plot { max-width: 46rem; }
+.grid { display: grid; gap: .8rem; grid-template-columns: repeat(auto-fit, minmax(min(15rem, 100%), 1fr)); }
 h3 { font-size: 1rem; margin: 1.2rem 0 .3rem; }
 """
 
@@ -46,7 +48,7 @@ def page(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
         _summary(measurement),
         _warning(measurement),
         "<h2>Error and time</h2>",
-        f'<div class="plot">{_picture(pictures, "speed_error.png", "Error against time; bars are quartiles of the time.")}</div>',
+        _plot(pictures, "speed_error.png", "Error against time; bars are quartiles of the time."),
         _scores(measurement),
         _score_notes(measurement),
         f"<h2>Pictures, view {measurement.judged_views[0]}</h2>",
@@ -72,10 +74,11 @@ def best_row(measurement: Measurement) -> Row:
 def _summary(measurement: Measurement) -> str:
     best, constant, ceiling = best_row(measurement), measurement.constant, measurement.ceiling
     state = "fitted" if best.is_fitted else "untuned"
+    score = best.validation
     return (
-        f"<p>Least error on {escape(measurement.judged_label)}: <strong>{escape(best.label)}, {state}</strong>, RMSE "
-        f"{best.validation.rmse:.4f}, PSNR {best.validation.psnr:.2f} dB, SSIM {best.validation.ssim:.4f} in "
-        f"{best.timing.median_ms:.0f} ms. A constant image at the fitted views' mean has RMSE {constant.validation.rmse:.4f}; "
+        f"<p>Least error on {escape(measurement.judged_label)}: <strong>{escape(best.label)}, {state}</strong>, "
+        f"RMSE {score.rmse:.4f}, PSNR {score.psnr:.2f} dB, SSIM {score.ssim:.4f} in {best.timing.median_ms:.3g} ms. "
+        f"A constant image at the fitted views' mean has RMSE {constant.validation.rmse:.4f}; "
         f"the reference's own noise alone gives {ceiling.rmse:.4f}.</p>"
     )
 
@@ -84,8 +87,8 @@ def _warning(measurement: Measurement) -> str:
     if not measurement.judged_on_training_views:
         return ""
     return (
-        '<p class="warning">Judged on the training view: no view was left that the fit had not seen, so the errors of the fitted '
-        "modules flatter them. Give the scene more cameras for an honest number.</p>"
+        '<p class="warning">Judged on the training view: no view was left that the fit had not seen, so the errors of '
+        "the fitted modules flatter them. Give the scene more cameras for an honest number.</p>"
     )
 
 
@@ -97,17 +100,23 @@ def _scores(measurement: Measurement) -> str:
 
 def _score_notes(measurement: Measurement) -> str:
     ceiling, settings = measurement.ceiling, measurement.settings
-    fit_views = ", ".join(map(str, measurement.fit_views))
-    return (
-        f'<p class="soft">Errors on {escape(measurement.judged_label)} first, on the fitted view(s) {fit_views} second; pixels of all '
-        "these views pooled, pixels that see nothing left out. Time: median (quartiles) of "
-        f"{measurement.rows[0].timing.repeats} forward passes over view {measurement.judged_views[0]}, models taking turns, no "
-        "gradients. Noise ceiling: what a perfect model would score against this reference. With s the reference's standard error "
-        f"at {settings.samples} rays a pixel, RMSE = sqrt(mean s²), PSNR = -20 log10 RMSE; two references with different seeds agree "
-        f"to SSIM {ceiling.ssim_pair:.4f}, and as only one of two compared pictures would be noisy, SSIM = 1 - (1 - "
-        f"{ceiling.ssim_pair:.4f}) / 2, which holds for small noise. Their RMSE divided by sqrt(2) is {ceiling.rmse_pair:.4f}, a check of "
-        f"the stated {ceiling.rmse:.4f}.</p>"
+    fitted_on = ", ".join(map(str, measurement.fit_views))
+    judged = (
+        f"Errors on {escape(measurement.judged_label)} first, on the fitted view(s) {fitted_on} second; pixels of all "
+        "these views pooled, pixels that see nothing left out."
     )
+    timed = (
+        f"Time: median (quartiles) of {measurement.rows[0].timing.repeats} forward passes over view "
+        f"{measurement.judged_views[0]}, models taking turns, no gradients."
+    )
+    noise = (
+        "Noise ceiling: what a perfect model would score against this reference. With s the reference's standard error "
+        f"at {settings.samples} rays a pixel, RMSE = sqrt(mean s²) and PSNR = -20 log10 RMSE. Two references with "
+        f"different seeds agree to SSIM {ceiling.ssim_pair:.4f}; only one of the two pictures would be noisy "
+        f"if the model were perfect, so SSIM = 1 - (1 - {ceiling.ssim_pair:.4f}) / 2, which holds for small noise. The "
+        f"RMSE of these two references divided by sqrt(2) is {ceiling.rmse_pair:.4f}, a check of the stated {ceiling.rmse:.4f}."
+    )
+    return f'<p class="soft">{judged} {timed} {noise}</p>'
 
 
 def _gallery(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
@@ -121,18 +130,15 @@ def _gallery(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
         label = next(row.label for row in measurement.rows if row.name == name)
         parts.append(f'<h3>{escape(label)}</h3><div class="grid">{"".join(figures)}</div>')
     parts.append(
-        '<p class="soft">Grey pictures are visibility in linear 8-bit grey without gamma, 255 = open. Error maps: red is too open, '
-        "blue too dark, grey sees nothing.</p>"
+        '<p class="soft">Grey pictures are visibility in linear 8-bit grey without gamma, 255 = open. Error maps: red '
+        "is too open, blue too dark, grey sees nothing.</p>"
     )
     return "\n".join(parts)
 
 
 def _values(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
-    plot = _picture(
-        pictures,
-        "fitted_values.png",
-        "Fitted values with standard errors; the dash is the start, hollow is undetermined.",
-    )
+    caption = "Fitted values with standard errors; the dash is the start, hollow is not determined by these views."
+    plot = _plot(pictures, "fitted_values.png", caption)
     fits = [
         f"<li>{escape(row.label)}: {row.fit.evaluations} evaluations, {row.fit.steps} steps, {row.fit.seconds:.1f} s: "
         f"{escape(row.fit.message)}</li>"
@@ -140,7 +146,7 @@ def _values(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
         if row.fit is not None
     ]
     table = _table(tables.VALUE_COLUMNS, tables.value_cells(measurement), text_columns=(1, 4))
-    return f'<div class="plot">{plot}</div>{table}<ul class="soft">{"".join(fits)}</ul>'
+    return f'{plot}{table}<ul class="soft">{"".join(fits)}</ul>'
 
 
 def _conditions(measurement: Measurement) -> str:
@@ -174,6 +180,10 @@ def _table(
         lines.append(f"<tr{' class=best' if index == best else ''}>{cells}</tr>")
     top = "".join(f"<th>{escape(title)}</th>" for title in head)
     return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
+
+
+def _plot(pictures: Mapping[str, bytes], name: str, caption: str) -> str:
+    return f'<div class="plot">{_picture(pictures, name, caption)}</div>' if name in pictures else ""
 
 
 def _picture(pictures: Mapping[str, bytes], name: str, caption: str) -> str:

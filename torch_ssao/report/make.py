@@ -37,8 +37,8 @@ def make_report(
     Args: those of `measure`.
     Returns: the `Measurement`; `files` names what was written to `out`: what `measure` writes, and report.html
         (self-contained), speed_error.png, fitted_values.png, and for the first judged view reference.png and, for every
-        model, <name>_untuned.png, <name>_fitted.png, <name>_untuned_error.png, <name>_fitted_error.png. Grey pictures are
-        visibility in linear 8-bit grey, 255 = open.
+        model, <name>_untuned.png, <name>_fitted.png, <name>_untuned_error.png, <name>_fitted_error.png. Grey pictures
+        are visibility in linear 8-bit grey, 255 = open.
     Raises: as `measure`, and MissingExtraError without the extra `report`, before any work.
     Cost: as `measure`, and about 0.3 s a picture.
     """

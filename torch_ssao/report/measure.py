@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -120,10 +120,10 @@ def measure(
 
     Args:
         scene: from `scenes.builtin` or `scenes.load`.
-        out: folder, made where it is missing. Written: a reference per view (read back by the next run), each fitted module
-            as JSON as soon as it is fitted, report.json.
-        views: the views to judge on; None for all of the scene. Those used for fitting are left out, unless none remains:
-            then the fitted views are judged and marked as training views everywhere.
+        out: folder, made where it is missing. Written: a reference per view (read back by the next run), each fitted
+            module as JSON as soon as it is fitted, report.json.
+        views: the views to judge on; None for all of the scene. Those used for fitting are left out, unless none
+            remains: then the fitted views are judged and marked as training views everywhere.
         height, width: image size in pixels, at least 11 (the window of SSIM).
         samples: rays a pixel of the reference, a power of two.
         fit_views: the views to fit on.
@@ -135,8 +135,8 @@ def measure(
         seed: of the reference's sampling pattern.
         progress: bars and notes on stderr; None shows them on a terminal only.
     Returns: a `Measurement`; its errors are of the judged views first and of the fitted views second.
-    Raises: RangeError, ChoiceError, SceneError for arguments that cannot be; MissingExtraError without the extras `scenes`
-        and `fitting`; OutputError before any work when `out` cannot be written.
+    Raises: RangeError, ChoiceError, SceneError for arguments that cannot be; MissingExtraError without the extras
+        `scenes` and `fitting`; OutputError before any work when `out` cannot be written.
     Cost: tracing dominates; see `reference.raytrace`. Judged views are traced twice, for the noise ceiling.
     """
     require("measure", "scenes", "trimesh", "embreex")  # before any work: without the extras nothing should be traced
@@ -146,30 +146,7 @@ def measure(
     fit_on, judged = _split_views(scene, views, fit_views)
     _check_arguments(settings, repeats, modules[0][2], parameters)
     folder = checks.check_output_folder("out", out)
-    note = _note(progress)
-
-    data = _trace_all(scene, fit_on, judged, settings, folder, progress, note)
-    fits, files = _fit_all(modules, data, folder, parameters, progress, note)
-    note("timing")
-    measured = _judge(fits, data, repeats)
-    mean = row_tools.best_constant(data.truth[data.training])
-    judged_on = (data.validation, data.training)
-    constant = Constant(mean, *(row_tools.score_constant(mean, data.truth[rows]) for rows in judged_on))
-    measurement = Measurement(
-        scene,
-        folder,
-        settings,
-        tuple(fit_on),
-        tuple(judged),
-        measured,
-        constant,
-        data.ceiling,
-        data.gbuffer[data.validation],
-        data.truth[data.validation],
-        environment(data.gbuffer.depth.device),
-        files,
-    )
-    return write_json(measurement)
+    return _run(_Plan(scene, folder, settings, modules, fit_on, judged, parameters, repeats, progress))
 
 
 def write_json(measurement: Measurement, *more_files: str) -> Measurement:
@@ -181,6 +158,30 @@ def write_json(measurement: Measurement, *more_files: str) -> Measurement:
     partial.write_text(json.dumps(measurement.as_dict(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     os.replace(partial, path)
     return measurement
+
+
+_Fit = tuple[str, str, AmbientVisibility, FitSummary | None]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """Checked arguments of a measurement."""
+
+    scene: Scene
+    folder: Path
+    settings: TraceSettings
+    modules: list[tuple[str, str, AmbientVisibility]]
+    fit_on: list[int]
+    judged: list[int]
+    parameters: tuple[str, ...] | None
+    repeats: int
+    progress: bool | None
+
+    def note(self, text: str) -> None:
+        """One line on stderr, where progress is shown."""
+        if sys.stderr.isatty() if self.progress is None else self.progress:
+            sys.stderr.write(text + "\n")
 
 
 @final
@@ -195,50 +196,64 @@ class _Data:
     ceiling: Ceiling
 
 
-def _trace_all(
-    scene: Scene,
-    fit_on: list[int],
-    judged: list[int],
-    settings: TraceSettings,
-    folder: Path,
-    progress: bool | None,
-    note: Callable[[str], None],
-) -> _Data:
+def _run(plan: _Plan) -> Measurement:
+    data = _trace_all(plan)
+    fits, files = _fit_all(plan, data)
+    plan.note("timing")
+    measured = _judge(fits, data, plan.repeats)
+    mean = row_tools.best_constant(data.truth[data.training])
+    judged_on = (data.validation, data.training)
+    constant = Constant(mean, *(row_tools.score_constant(mean, data.truth[rows]) for rows in judged_on))
+    measurement = Measurement(
+        scene=plan.scene,
+        out=plan.folder,
+        settings=plan.settings,
+        fit_views=tuple(plan.fit_on),
+        judged_views=tuple(plan.judged),
+        rows=measured,
+        constant=constant,
+        ceiling=data.ceiling,
+        gbuffer=data.gbuffer[data.validation],
+        truth=data.truth[data.validation],
+        environment=environment(data.gbuffer.depth.device),
+        files=files,
+    )
+    return write_json(measurement)
+
+
+def _trace_all(plan: _Plan) -> _Data:
     from torch_ssao import scenes
 
-    traced = sorted({*fit_on, *judged})
-    gbuffer = scenes.render(scene, views=traced, height=settings.height, width=settings.width)
-    truth = trace_views(scene, traced, settings, folder, progress=progress, note=note)
+    settings = plan.settings
+    traced = sorted({*plan.fit_on, *plan.judged})
+    gbuffer = scenes.render(plan.scene, views=traced, height=settings.height, width=settings.width)
+
+    def trace(views: list[int], seed: int) -> Truth:
+        seeded = replace(settings, seed=seed)
+        return trace_views(plan.scene, views, seeded, plan.folder, progress=plan.progress, note=plan.note)
+
+    truth = trace(traced, settings.seed)
     # A pixel that the technique holds for empty is not its error: judge what both see.
     truth = replace(truth, valid=truth.valid & gbuffer.valid_mask[:, :1].cpu())
-    training, validation = ([traced.index(view) for view in chosen] for chosen in (fit_on, judged))
-    again = replace(settings, seed=settings.seed + CEILING_SEED_STEP)
-    second = trace_views(scene, judged, again, folder, progress=progress, note=note)
+    training, validation = ([traced.index(view) for view in chosen] for chosen in (plan.fit_on, plan.judged))
+    second = trace(plan.judged, settings.seed + CEILING_SEED_STEP)
     return _Data(gbuffer, truth, training, validation, noise_ceiling(truth[validation], second))
 
 
-_Fit = tuple[str, str, AmbientVisibility, FitSummary | None]
-
-
-def _fit_all(
-    modules: list[tuple[str, str, AmbientVisibility]],
-    data: _Data,
-    folder: Path,
-    parameters: tuple[str, ...] | None,
-    progress: bool | None,
-    note: Callable[[str], None],
-) -> tuple[list[_Fit], tuple[str, ...]]:
+def _fit_all(plan: _Plan, data: _Data) -> tuple[list[_Fit], tuple[str, ...]]:
     """All modules untuned, then fitted; each fitted one is saved at once."""
     from torch_ssao import fitting
 
     gbuffer, truth = data.gbuffer[data.training], data.truth[data.training]
     fitted: list[_Fit] = []
-    for name, label, module in modules:
-        note(f"fitting {label}")
-        result = fitting.fit(module, gbuffer, truth, parameters=parameters, valid=truth.valid, progress=progress)
-        serialize.save(result.module, folder / f"{name}.json")
+    for name, label, module in plan.modules:
+        plan.note(f"fitting {label}")
+        result = fitting.fit(
+            module, gbuffer, truth, parameters=plan.parameters, valid=truth.valid, progress=plan.progress
+        )
+        serialize.save(result.module, plan.folder / f"{name}.json")
         fitted.append((name, label, result.module, _summarise(result)))
-    untuned: list[_Fit] = [(*entry, None) for entry in modules]
+    untuned: list[_Fit] = [(*entry, None) for entry in plan.modules]
     return untuned + fitted, tuple(f"{name}.json" for name, *_ in fitted)
 
 
@@ -275,8 +290,3 @@ def _check_arguments(
 def _summarise(result: Any) -> FitSummary:
     errors, undetermined = dict(result.standard_errors), tuple(result.undetermined)
     return FitSummary(errors, undetermined, result.steps, result.evaluations, result.seconds, result.message)
-
-
-def _note(progress: bool | None) -> Callable[[str], None]:
-    shown = sys.stderr.isatty() if progress is None else progress
-    return (lambda text: print(text, file=sys.stderr, flush=True)) if shown else (lambda text: None)  # noqa: T201

@@ -45,7 +45,7 @@ def speed_error_png(measurement: Measurement) -> bytes:
         for row, x, y in zip(rows, middle, error, strict=True):
             # Untuned labels above and fitted ones below: the two curves rarely cross.
             shift = (0, -16) if fitted else (0, 9)
-            style = {"ha": "center", "fontsize": 8, "color": colour}
+            style: dict[str, Any] = {"ha": "center", "fontsize": 8, "color": colour}
             axes.annotate(row.label, (x, y), xytext=shift, textcoords="offset points", **style)
     constant, ceiling = measurement.constant.validation.rmse, measurement.ceiling.rmse
     axes.axhline(constant, color="0.35", linestyle="--", linewidth=1.1, label=f"constant image, {constant:.3f}")
@@ -59,8 +59,8 @@ def _finish(axes: Any, measurement: Measurement) -> None:
     axes.set_xscale("log")
     _readable_ticks(axes.xaxis)
     axes.margins(x=0.12)
-    axes.set_ylim(0, None)
-    axes.margins(y=0.12)
+    worst = max(row.validation.rmse for row in measurement.rows)
+    axes.set_ylim(0, 1.15 * max(worst, measurement.constant.validation.rmse))  # room for the label of the worst
     threads_text = f"{threads} thread{'s' if threads != 1 else ''}"
     axes.set_xlabel(f"milliseconds a view, forward, {settings.width}x{settings.height}, {threads_text}")
     axes.set_ylabel(f"RMSE of visibility, {measurement.judged_label}")
@@ -82,29 +82,28 @@ def fitted_values_png(measurement: Measurement) -> bytes | None:
     figure = Figure(figsize=(7.0, 2.3 * math.ceil(len(names) / 2)), dpi=120, layout="constrained")
     for index, name in enumerate(names):
         axes = figure.add_subplot(math.ceil(len(names) / 2), 2, index + 1)
-        for x, row in enumerate(fitted):
-            value, error = row.module.values()[name], _error(row, name)
-            # Hollow: the views do not determine it, or it was not fitted.
-            axes.errorbar(
-                x,
-                value,
-                yerr=error,
-                marker="o",
-                markersize=6,
-                capsize=3,
-                color=FITTED,
-                markerfacecolor="white" if error is None else FITTED,
-            )
-            if row.name in start:
-                axes.plot(x, start[row.name][name], marker="_", markersize=12, color=UNTUNED)
-        spec = fitted[0].module.PARAMETERS[name]
-        axes.set_title(name if spec.unit == "1" else f"{name} ({spec.unit})", fontsize=9)
-        axes.set_yscale("log")
-        _readable_ticks(axes.yaxis)
-        axes.margins(x=0.15, y=0.25)
-        axes.set_xticks(range(len(fitted)), [row.label for row in fitted], fontsize=8)
-        axes.grid(True, axis="y", which="both", color="0.9", linewidth=0.6)
+        _draw_parameter(axes, name, fitted, start)
     return figure_png(figure)
+
+
+def _draw_parameter(axes: Any, name: str, fitted: list[Row], start: dict[str, dict[str, float]]) -> None:
+    drawn = []
+    for x, row in enumerate(fitted):
+        value, error = row.module.values()[name], _error(row, name)
+        face = "white" if error is None else FITTED  # hollow: the views do not determine it, or it was not fitted
+        axes.errorbar(x, value, yerr=error, marker="o", markersize=6, capsize=3, color=FITTED, markerfacecolor=face)
+        drawn += [value - (error or 0.0), value + (error or 0.0)]
+        if row.name in start:
+            drawn.append(start[row.name][name])
+            axes.plot(x, drawn[-1], marker="_", markersize=12, color=UNTUNED)
+    spec = fitted[0].module.PARAMETERS[name]
+    axes.set_title(name if spec.unit == "1" else f"{name} ({spec.unit})", fontsize=9)
+    axes.set_yscale("log")
+    axes.set_ylim(min(drawn) / 1.5, max(drawn) * 1.5)  # wide enough for two ticks however little the values differ
+    _readable_ticks(axes.yaxis)
+    axes.margins(x=0.15)
+    axes.set_xticks(range(len(fitted)), [row.label for row in fitted], fontsize=8)
+    axes.grid(True, axis="y", which="both", color="0.9", linewidth=0.6)
 
 
 def _error(row: Row, name: str) -> float | None:
@@ -113,8 +112,8 @@ def _error(row: Row, name: str) -> float | None:
     error = row.fit.standard_errors.get(name, math.nan)
     if not math.isfinite(error):
         return None
-    # The axis is logarithmic: a bar that reached zero would not be drawn at all.
-    return min(error, 0.99 * row.module.values()[name])
+    # The axis is logarithmic: a bar that reached zero would have no end.
+    return min(error, 0.9 * row.module.values()[name])
 
 
 def _readable_ticks(axis: Any) -> None:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 COLUMNS = ("model", "RMSE", "PSNR", "SSIM", "training RMSE", "PSNR", "SSIM", "ms a view (quartiles)")
 VALUE_COLUMNS = ("model", "parameter", "value", "standard error", "meaning")
 
+UNDETERMINED = "not determined by these views"
+
 
 def score_cells(measurement: Measurement) -> list[list[str]]:
     """Rows of the table of errors under `COLUMNS`: untuned, then fitted modules, constant image, noise ceiling."""
@@ -34,6 +36,18 @@ def value_cells(measurement: Measurement) -> list[list[str]]:
             spec = row.module.PARAMETERS[name]
             cells.append([row.label, name, f"{value:.4g}", _uncertainty(row, name), f"{spec.meaning} ({spec.unit})"])
     return cells
+
+
+def value_matrix(measurement: Measurement) -> tuple[list[str], list[list[str]]]:
+    """Head and rows of the fitted values, a model a row with one cell "value ± standard error" per parameter."""
+    fitted = [row for row in measurement.rows if row.fit is not None]
+    names = list(fitted[0].module.PARAMETERS) if fitted else []
+    cells = []
+    for row in fitted:
+        values = row.module.values()
+        texts = [f"{values[name]:.4g} {_uncertainty(row, name)}" for name in names]
+        cells.append([row.label, *(text.replace(UNDETERMINED, "(undetermined)") for text in texts)])
+    return ["fitted values", *names], cells
 
 
 def text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -76,5 +90,5 @@ def _uncertainty(row: Row, name: str) -> str:
         return "not fitted"
     error = row.fit.standard_errors.get(name, math.nan)
     if name in row.fit.undetermined or not math.isfinite(error):
-        return "not determined by these views"
+        return UNDETERMINED
     return f"± {error:.2g}"

@@ -72,7 +72,7 @@ class Ceiling:
         rmse: root of the mean squared standard error over the judged pixels.
         psnr: -20 log10(rmse).
         ssim: 1 - (1 - ssim_pair) / 2: only one of the two pictures compared is noisy.
-        rmse_pair: RMSE between two independent references of the same sample count, divided by sqrt(2): a check of `rmse`.
+        rmse_pair: RMSE between two independent references of that sample count, divided by sqrt(2): a check of `rmse`.
         ssim_pair: SSIM between these two, a lower bound of the ceiling.
     """
 
@@ -98,9 +98,9 @@ def trace_views(
         scene: what is traced.
         views: indices into `scene.cameras`; the batch follows their order.
         settings: size, radius, samples, seed and falloff.
-        folder: where `reference_<view>_<fingerprint>.npz` are read and written, one a view: an interrupted run keeps what
-            it finished. The fingerprint covers mesh, views, settings and the package's version. A file that is truncated,
-            foreign or made for something else is traced again and replaced.
+        folder: where `reference_<view>_<fingerprint>.npz` are read and written, one a view: an interrupted run keeps
+            what it finished. The fingerprint covers mesh, views, settings and the package's version. A file that is
+            truncated, foreign or made for something else is traced again and replaced.
         progress: bar of the tracer; None shows it on a terminal only.
         note: called with one line before each view that has to be traced.
     Raises: as `reference.raytrace`.
@@ -126,9 +126,9 @@ def noise_ceiling(first: Truth, second: Truth) -> Ceiling:
 
     Args:
         first, second: references of the same views and sample count with different seeds.
-    Returns: see `Ceiling`. With reference = truth + noise of standard error s, a perfect model's RMSE is sqrt(mean(s^2)).
-        Two references differ by twice that variance, and for small noise 1 - SSIM is proportional to the variance: hence
-        the halving.
+    Returns: see `Ceiling`. With reference = truth + noise of standard error s, a perfect model's RMSE is
+        sqrt(mean(s^2)). Two references differ by twice that variance, and for small noise 1 - SSIM is proportional to
+        the variance: hence the halving.
     """
     valid = first.valid & second.valid
     rmse = float(first.standard_error[first.valid].double().square().mean().sqrt())

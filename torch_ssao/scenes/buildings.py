@@ -11,7 +11,10 @@ Parts = tuple[Builder, tuple[View, ...], float]
 
 
 def temple() -> Parts:
-    """Steps, columns round all sides, gabled roof, an inner room with an altar. Returns: mesh, views, radius."""
+    """Steps, columns round all sides, gabled roof, an inner room with an altar.
+
+    Returns: mesh, views, radius.
+    """
     b = Builder()
     b.quad(40.0)
     for i in range(3):  # steps
@@ -57,7 +60,10 @@ def _column(b: Builder, x: float, z: float, floor: float, top: float) -> None:
 
 
 def street() -> Parts:
-    """Two rows of houses with window recesses, kerbs, lamps and cars. Returns: mesh, views, radius."""
+    """Two rows of houses with window recesses, kerbs, lamps and cars.
+
+    Returns: mesh, views, radius.
+    """
     b = Builder()
     b.quad(60.0)
     for x in (-5.5, 3.5):  # pavements along a road of 7 m

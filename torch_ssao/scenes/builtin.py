@@ -27,9 +27,9 @@ def builtin(name: str) -> Scene:
     """One of the built-in scenes: a mesh in metres, y up, four views and a radius; the same every time.
 
     Args:
-        name: "temple" (steps, columns, gabled roof, inner room), "room" (furniture, shelves, legs), "street" (houses with window
-            recesses, kerbs), "pipes" (pipes, fence and wire: thin geometry), "heap" (spheres and tori piled on a plane) or "stairs"
-            (two flights, landing, balusters).
+        name: "temple" (steps, columns, gabled roof, inner room), "room" (furniture, shelves, legs), "street" (houses
+            with window recesses, kerbs), "pipes" (pipes, fence and wire: thin geometry), "heap" (spheres and tori
+            piled on a plane) or "stairs" (two flights, landing, balusters).
     Raises: ChoiceError for another name; SceneError when trimesh is not installed.
     Cost: under 0.2 s the first time, nothing later.
     """

@@ -26,11 +26,12 @@ def read_cameras(cameras: Any, stem: str) -> tuple[tuple[View, ...], float | Non
     """Views, and the radius that comes with them if any, from a JSON file or from what such a file holds.
 
     Args:
-        cameras: path of a JSON file, or its content: a list of {"eye", "target", "up", "fov_y_deg"} or `View`; or {"views": such a
-            list, "ao_radius": number}, of which the radius may be missing; or {mesh name: such a record}, of which the entry `stem`
-            is taken. "up" defaults to y and "fov_y_deg" to 60.
+        cameras: path of a JSON file, or its content: a list of {"eye", "target", "up", "fov_y_deg"} or `View`; or
+            {"views": such a list, "ao_radius": number}, of which the radius may be missing; or {mesh name: such a
+            record}, of which the entry `stem` is taken. "up" defaults to y and "fov_y_deg" to 60.
         stem: file name of the mesh without its ending.
-    Raises: SceneError for a file that is missing or no JSON, a missing key, no view; ShapeError and RangeError as `View`.
+    Returns: views, and the radius in scene units or None.
+    Raises: SceneError for a file that is missing or no JSON, a missing key, no view; others as `View`.
     """
     origin = "cameras"
     if isinstance(cameras, (str, Path)):
@@ -39,12 +40,16 @@ def read_cameras(cameras: Any, stem: str) -> tuple[tuple[View, ...], float | Non
     if isinstance(cameras, Mapping) and "views" not in cameras:
         if stem not in cameras:
             known = ", ".join(map(repr, list(cameras)[:12])) or "nothing"
-            raise checks.SceneError(f"{origin} must have the key 'views' or {stem!r}, got {known}: add one, or rename the mesh file")
+            raise checks.SceneError(
+                f"{origin} must have the key 'views' or {stem!r}, got {known}: add one, or rename the mesh file"
+            )
         origin, cameras = f"{origin}[{stem!r}]", cameras[stem]
     radius = None
     if isinstance(cameras, Mapping):
         if "views" not in cameras:
-            raise checks.SceneError(f"{origin} must have the key 'views', got {', '.join(map(repr, cameras)) or 'nothing'}: add it")
+            raise checks.SceneError(
+                f"{origin} must have the key 'views', got {', '.join(map(repr, cameras)) or 'nothing'}: add it"
+            )
         radius = cameras.get("ao_radius")
         if radius is not None:
             checks.check_positive(f"{origin}['ao_radius']", radius)
@@ -52,15 +57,18 @@ def read_cameras(cameras: Any, stem: str) -> tuple[tuple[View, ...], float | Non
     if isinstance(cameras, View):
         cameras = [cameras]
     if not isinstance(cameras, Sequence) or isinstance(cameras, str) or len(cameras) == 0:
-        raise checks.SceneError(f"{origin} must hold a list with at least one view, got {cameras!r}: write [{{'eye': ..., 'target': ...}}]")
+        raise checks.SceneError(
+            f"{origin} must hold a list with at least one view, got {cameras!r}: write [{{'eye': ..., 'target': ...}}]"
+        )
     return tuple(_view(f"{origin}[{i}]", record) for i, record in enumerate(cameras)), radius
 
 
 def place_views(vertices: Float64, faces: Int64, rays: RayCaster) -> tuple[View, ...]:
     """Four views of a mesh that comes without any; y is taken to point up. The same mesh gives the same views.
 
-    Where rays from most of its faces reach the sky it is an object or an open place and is seen from around, slightly from above;
-    where they do not, and rays from the middle end on the mesh too, it is an interior and is seen from the roomiest places inside.
+    Where rays from most of its faces reach the sky it is an object or an open place and is seen from around, slightly
+    from above; where they do not, and rays from the middle end on the mesh too, it is an interior and is seen from
+    inside.
 
     Args:
         vertices: (V, 3). faces: (F, 3) rows of it. rays: the same mesh.
@@ -79,12 +87,14 @@ def place_views(vertices: Float64, faces: Int64, rays: RayCaster) -> tuple[View,
     if len(views) < PLACED_VIEWS:
         views = _outside((low + high) / 2, size, rays)
     if not views:
-        raise checks.SceneError("cameras could not be placed automatically: no view found that sees the mesh, pass cameras")
+        raise checks.SceneError(
+            "cameras could not be placed automatically: no view found that sees the mesh, pass cameras"
+        )
     return tuple(views)
 
 
 def seen_distances(views: Sequence[View], rays: RayCaster, height: int = 24, width: int = 32) -> Float64:
-    """Distances, in scene units, from the eyes to what a coarse grid of their pixels sees; empty where nothing is hit."""
+    """View-space depths, in scene units, that a coarse grid of the views' pixels sees; empty where none hits."""
     found = [rays.first_hit(np.asarray(view.eye), _frustum(view, height, width))[1] for view in views]
     distance = np.concatenate(found)
     return distance[np.isfinite(distance)]
@@ -103,10 +113,14 @@ def _view(origin: str, record: Any) -> View:
     if isinstance(record, View):
         return record
     if not isinstance(record, Mapping):
-        raise checks.SceneError(f"{origin} must be {{'eye', 'target', 'up', 'fov_y_deg'}}, got {record!r}: write one object per view")
+        raise checks.SceneError(
+            f"{origin} must be {{'eye', 'target', 'up', 'fov_y_deg'}}, got {record!r}: write one object per view"
+        )
     for key in ("eye", "target"):
         if key not in record:
-            raise checks.SceneError(f"{origin} must have the key {key!r}, got {', '.join(map(repr, record)) or 'nothing'}: add it")
+            raise checks.SceneError(
+                f"{origin} must have the key {key!r}, got {', '.join(map(repr, record)) or 'nothing'}: add it"
+            )
     try:
         return View(record["eye"], record["target"], record.get("up", _UP), record.get("fov_y_deg", 60.0))
     except ValueError as error:
@@ -151,15 +165,21 @@ def _inside(low: Float64, high: Float64, rays: RayCaster) -> list[View]:
         seen, detail = _cast(eyes, frustum / np.linalg.norm(frustum, axis=1, keepdims=True), rays)
         covered = np.isfinite(seen).mean(axis=1)
         near = np.where(np.isfinite(seen), seen, np.inf).min(axis=1)
-        score = np.log(np.where(np.isfinite(seen), seen, 0.02 * diagonal) / diagonal + 1e-3).mean(axis=1) + np.log(detail)
-        score = np.where((covered >= 0.9) & (near >= 0.02 * diagonal), score, -np.inf)
-        candidates += [(float(s), i, j) for i, s in enumerate(score) if np.isfinite(s)]
+        merit = np.log(np.where(np.isfinite(seen), seen, 0.02 * diagonal) / diagonal + 1e-3).mean(axis=1) + np.log(
+            detail
+        )
+        merit = np.where((covered >= 0.9) & (near >= 0.02 * diagonal), merit, -np.inf)
+        candidates += [(float(s), i, j) for i, s in enumerate(merit) if np.isfinite(s)]
     candidates.sort(key=lambda c: (-c[0], c[1], c[2]))
     chosen: list[tuple[int, int]] = []
-    for apart in (0.25, 0.12, 0.05):  # relax where the place is small
-        for _, i, j in candidates:
+    # Among good views first, ever nearer ones where the place is small; a dull view is better than none.
+    for apart, margin in ((0.25, 0.5), (0.12, 0.5), (0.05, 0.5), (0.05, np.inf)):
+        for score, i, j in candidates:
+            if score < candidates[0][0] - margin:
+                break
             distinct = all(
-                np.linalg.norm(eyes[i] - eyes[k]) > apart * diagonal or (apart < 0.25 and ahead[j] @ ahead[m] < 0.3) for k, m in chosen
+                np.linalg.norm(eyes[i] - eyes[k]) > apart * diagonal or (apart < 0.25 and ahead[j] @ ahead[m] < 0.3)
+                for k, m in chosen
             )
             if distinct and len(chosen) < PLACED_VIEWS:
                 chosen.append((i, j))
@@ -200,7 +220,7 @@ def sphere_directions(count: int) -> Float64:
 
 
 def _cast(eyes: Float64, directions: Float64, rays: RayCaster) -> tuple[Float64, Int64]:
-    """(N, M) distances along every direction from every eye, inf for none; (N,) how many different triangles are hit, at least 1."""
+    """(N, M) distances along every direction from every eye, inf for none; (N,) count of different triangles hit."""
     origins = np.repeat(eyes, len(directions), axis=0)
     triangle, distance = rays.first_hit(origins, np.tile(directions, (len(eyes), 1)))
     ordered = np.sort(triangle.reshape(len(eyes), -1), axis=1)

@@ -16,6 +16,7 @@ if and only if its ray has hit the boundary within rho, so volumetric obscurance
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -196,8 +197,7 @@ def raised_slat(
         return 1.0 - occlusion / math.pi
 
     def binary(reach: ArrayLike) -> Array:
-        s = np.minimum(x / np.maximum(reach, _TINY), 1.0)
-        return (_strip(high / far, s) - _strip(low / np.maximum(near, _TINY), s)) / math.pi
+        return (_strip(x, high, reach) - _strip(x, low, reach)) / math.pi
 
     return 1.0 - _attenuated(binary, radius, exponent, (near / radius, far / radius))
 
@@ -332,11 +332,14 @@ def _ramp(s: Array, exponent: int | None) -> Array:
     return (1.0 - s) ** 2 * (1.0 if exponent == 2 else 1.0 + 0.5 * s)
 
 
-def _strip(sine: Array, s: Array) -> Array:
-    """Integral of sqrt(1 - s^2 / cos^2) over elevations from 0 to asin(sine), as far as it is real."""
-    q = np.sqrt(1.0 - s**2)
-    w = np.minimum(sine, q)
-    return np.arctan2(w, np.sqrt(q**2 - w**2)) - s * np.arctan2(s * w, np.sqrt(q**2 - w**2))
+def _strip(x: Array, height: Array, reach: ArrayLike) -> Array:
+    """Integral of sqrt(1 - s^2 / cos^2), s = x / reach, over elevations from 0 to that of an edge, as far as it is real."""
+    s = np.minimum(x / np.maximum(reach, _TINY), 1.0)
+    edge = np.maximum(np.hypot(x, height), _TINY)
+    short = np.minimum(edge / np.maximum(reach, _TINY), 1.0)
+    w = np.minimum(height / edge, np.sqrt(1.0 - s**2))
+    chord = x / edge * np.sqrt(1.0 - short**2)  # sqrt(q^2 - w^2) without its cancellation
+    return np.asarray(np.arctan2(w, chord) - s * np.arctan2(s * w, chord))
 
 
 def _cap(cos_half: Array, tilt: Array, kernel: str) -> Array:
@@ -366,7 +369,7 @@ def _attenuated(
         return binary(radius)
     edges = np.sort(np.stack([np.clip(b, 1e-14, 1.0) for b in (*np.broadcast_arrays(*breaks), 1.0 + 0.0 * breaks[0])]), axis=0)
     total = np.zeros(edges.shape[1:])
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges):
         span = np.log(high / low)
         for node, weight in zip(_NODES + 0.5, _NODE_WEIGHTS, strict=True):
             # Logarithmic in t for small distances; the cubic removes the square roots at both ends.

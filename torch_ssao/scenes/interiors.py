@@ -11,7 +11,10 @@ Parts = tuple[Builder, tuple[View, ...], float]
 
 
 def room() -> Parts:
-    """Table and chairs, shelves with books, sofa, lamp; closed but for a window and a door. Returns: mesh, views, radius."""
+    """Table and chairs, shelves with books, sofa, lamp; closed but for a window and a door.
+
+    Returns: mesh, views, radius.
+    """
     b = Builder()
     b.box((-3.2, -0.2, -2.7), (3.2, 0.0, 2.7))
     b.box((-3.2, 2.7, -2.7), (3.2, 2.9, 2.7))
@@ -95,7 +98,10 @@ def _shelf(b: Builder) -> None:
 
 
 def stairs() -> Parts:
-    """Two flights about a landing in a stairwell, with balusters, handrails and an open underside. Returns: mesh, views, radius."""
+    """Two flights about a landing in a stairwell, with balusters, handrails and an open underside.
+
+    Returns: mesh, views, radius.
+    """
     b = Builder()
     rise, run, steps = 0.175, 0.28, 10
     half = steps * rise
@@ -125,7 +131,11 @@ def stairs() -> Parts:
     for x in np.arange(0.4, 2.4, 0.14):  # balustrade of the upper floor
         b.rod((x, 2 * half, 1.05), (x, 2 * half + 0.9, 1.05), 0.012, sections=8)
     b.rod((-0.3, 2 * half + 0.9, 1.05), (2.4, 2 * half + 0.9, 1.05), 0.03, sections=12)
-    for low, high in (((-2.2, 0.0, -0.2), (-1.5, 0.6, 0.5)), ((-2.1, 0.6, -0.1), (-1.65, 0.95, 0.35)), ((-1.3, 0.0, -0.9), (-0.9, 0.4, -0.4))):
+    for low, high in (
+        ((-2.2, 0.0, -0.2), (-1.5, 0.6, 0.5)),
+        ((-2.1, 0.6, -0.1), (-1.65, 0.95, 0.35)),
+        ((-1.3, 0.0, -0.9), (-0.9, 0.4, -0.4)),
+    ):
         b.box(low, high, turn_deg=8.0)  # boxes stored under the second flight
     views = (
         View((-0.4, 1.65, 2.8), (0.7, 1.2, -1.6), fov_y_deg=65.0),

@@ -31,8 +31,8 @@ def face_normals(vertices: Float64, faces: Int64) -> Float64:
 def corner_normals(vertices: Float64, faces: Int64, crease_deg: float = CREASE_DEG) -> Float64:
     """Smooth normals per face corner: angle-weighted means over the faces round a vertex that meet without a crease.
 
-    Vertices at exactly one place count as one, so files with split vertices are smoothed too. A neighbour wound the other way is
-    flipped first: faces are two-sided.
+    Vertices at exactly one place count as one, so files with split vertices are smoothed too. A neighbour wound the
+    other way is flipped first: faces are two-sided.
 
     Args:
         vertices: (V, 3). faces: (F, 3) rows of it.

@@ -12,11 +12,20 @@ Parts = tuple[Builder, tuple[View, ...], float]
 
 
 def pipes() -> Parts:
-    """Pipes on a wall, a tank, a picket fence and a wire fence: thin geometry. Returns: mesh, views, radius."""
+    """Pipes on a wall, a tank, a picket fence and a wire fence: thin geometry.
+
+    Returns: mesh, views, radius.
+    """
     b = Builder()
     b.quad(25.0)
     b.box((-7.0, 0.0, -3.4), (7.0, 4.0, -3.0))
-    for y, out, radius in ((0.35, 0.28, 0.16), (0.8, 0.2, 0.09), (1.15, 0.2, 0.05), (2.6, 0.34, 0.2), (3.2, 0.18, 0.06)):
+    for y, out, radius in (
+        (0.35, 0.28, 0.16),
+        (0.8, 0.2, 0.09),
+        (1.15, 0.2, 0.05),
+        (2.6, 0.34, 0.2),
+        (3.2, 0.18, 0.06),
+    ):
         b.rod((-6.8, y, -3.0 + out), (6.8, y, -3.0 + out), radius)
         for x in np.arange(-6.0, 6.1, 2.0):  # flanges and brackets
             b.rod((x - 0.04, y, -3.0 + out), (x + 0.04, y, -3.0 + out), radius * 1.3)
@@ -87,18 +96,21 @@ def _clipped(
 
 
 def heap() -> Parts:
-    """Spheres and rings piled on a plane. Returns: mesh, views, radius."""
+    """Spheres and rings piled on a plane.
+
+    Returns: mesh, views, radius.
+    """
     b = Builder()
     b.quad(15.0)
     rng = np.random.default_rng(5)
-    placed: list[tuple[NDArray[np.float64], float]] = []
+    placed: list[tuple[tuple[float, float, float], float]] = []
     for i in range(46):
         ring = i % 3 == 0
         size = float(rng.uniform(0.3, 0.5) if ring else rng.uniform(0.16, 0.42))
         body = size * (0.55 if ring else 1.0)
         drops = [(_rest_height(placed, x, z, body), x, z) for x, z in rng.normal(0.0, 0.8, (10, 2))]
         y, x, z = min(drops)  # the lowest of ten places: a heap, not a tower
-        center = np.array([x, y, z])
+        center = (float(x), float(y), float(z))
         if ring:
             b.torus(center, size * 0.75, size * 0.25, _tilt(rng))
         else:
@@ -121,7 +133,7 @@ def heap() -> Parts:
     return b, views, 0.4
 
 
-def _rest_height(placed: list[tuple[NDArray[np.float64], float]], x: float, z: float, radius: float) -> float:
+def _rest_height(placed: list[tuple[tuple[float, float, float], float]], x: float, z: float, radius: float) -> float:
     """Lowest height at which a ball dropped at (x, z) touches the ground or an earlier one."""
     height = radius
     for center, other in placed:

@@ -69,11 +69,12 @@ class RayCaster:
             directions: (N, 3) float64, any length but zero; distances count in these lengths.
             max_distance: longest distance, a number or (N,); None for endless rays.
             threads: threads to use; None for every core this process may run on.
-        Returns: triangle (N,) int64, -1 where nothing is hit; distance (N,) float64 from the triangle's plane, inf there.
+        Returns: triangle (N,) int64, -1 for none; distance (N,) float64 from the triangle's plane, inf for none.
         Cost: about 1 us a ray and thread.
         """
         origins = np.broadcast_to(np.asarray(origins, dtype=np.float64), directions.shape)
-        reach = np.broadcast_to(np.asarray(MISS_DISTANCE if max_distance is None else max_distance), directions.shape[:1])
+        limit = np.asarray(MISS_DISTANCE if max_distance is None else max_distance)
+        reach = np.broadcast_to(limit, directions.shape[:1])
         triangle = np.full(len(directions), -1, dtype=np.int64)
         distance = np.full(len(directions), np.inf)
 
@@ -88,7 +89,8 @@ class RayCaster:
             hit = np.flatnonzero(found["primID"] >= 0)
             face = found["primID"][hit].astype(np.int64)
             triangle[part][hit] = face
-            distance[part][hit] = self._plane_distance(face, local[hit], along[hit], found["tfar"][hit].astype(np.float64))
+            rough = found["tfar"][hit].astype(np.float64)
+            distance[part][hit] = self._plane_distance(face, local[hit], along[hit], rough)
 
         _in_chunks(trace, len(directions), threads)
         return triangle, distance
@@ -140,7 +142,7 @@ class RayCaster:
     def _plane_distance(self, face: Int64, origins: Float64, directions: Float64, embree: Float64) -> Float64:
         normal = self._normal[face]
         along = np.einsum("ij,ij->i", normal, directions)
-        # A ray within its plane has no intersection to compute, and near one the quotient is worse than embree's answer.
+        # Within its plane a ray has no intersection to compute, and near that embree's answer is the better one.
         length = np.linalg.norm(normal, axis=1) * np.linalg.norm(directions, axis=1)
         grazing = np.abs(along) <= 1e-6 * length
         exact = np.einsum("ij,ij->i", normal, self._anchor[face] - origins) / np.where(grazing, 1.0, along)
@@ -173,5 +175,7 @@ def _import_embree() -> tuple[Any, Any]:
     try:
         from embreex import mesh_construction, rtcore_scene
     except ImportError as error:
-        raise checks.SceneError("tracing rays needs embreex, which is not installed: pip install torch_ssao[scenes]") from error
+        raise checks.SceneError(
+            "tracing rays needs embreex, which is not installed: pip install torch_ssao[scenes]"
+        ) from error
     return rtcore_scene, mesh_construction

@@ -105,10 +105,10 @@ def render(
         triangles: also keep the vertices of the triangle that each pixel sees.
         normals: "smooth" - interpolated between corners, hard over creases; "geometric" - of the triangle's plane.
         dtype: floating-point type of the result; rays are computed in float64 whatever it is.
-    Returns: a GBuffer of batch len(views); pixels that see nothing have depth inf, normal 0 and are invalid. Normals face the eye:
-        faces are two-sided, and a smooth normal that looks away is replaced by the geometric one.
-    Raises: RangeError for a size, view or layer count that does not exist; ChoiceError for `normals` or `triangles`; DtypeError for a
-        dtype that is not floating point; SceneError for a view that sees nothing.
+    Returns: a GBuffer of batch len(views); pixels that see nothing have depth inf, normal 0 and are invalid. Normals
+        face the eye: faces are two-sided, and a smooth normal that looks away is replaced by the geometric one.
+    Raises: RangeError for a size, view or layer count that does not exist; ChoiceError for `normals` or `triangles`;
+        DtypeError for a dtype that is not floating point; SceneError for a view that sees nothing.
     Cost: as `primary_hits`, per view.
     """
     checks.check_count("height", height, 1)
@@ -131,9 +131,13 @@ def render(
 def _check_available(layers: int, triangles: bool) -> None:
     checks.check_count("layers", layers, 1)
     if layers > 1:
-        raise checks.RangeError(f"layers must be 1, got {layers}: depth-peeled layers are not available yet, leave layers out")
+        raise checks.RangeError(
+            f"layers must be 1, got {layers}: depth-peeled layers are not available yet, leave layers out"
+        )
     if triangles:
-        raise checks.ChoiceError("triangles must be False, got True: triangle buffers are not available yet, leave triangles out")
+        raise checks.ChoiceError(
+            "triangles must be False, got True: triangle buffers are not available yet, leave triangles out"
+        )
 
 
 def _normals(scene: Scene, triangle: NDArray[np.int64], position: Float64, eye: Float64) -> tuple[Float64, Float64]:

@@ -30,8 +30,8 @@ class View:
     Args:
         eye, target, up: world-space point, point looked at, upward direction, in scene units.
         fov_y_deg: vertical field of view in degrees, in (0, 180).
-    Raises: ShapeError for vectors that are not three numbers; RangeError for values that are not finite, a field of view outside
-        (0, 180), a target equal to the eye, or an `up` along the view.
+    Raises: ShapeError for vectors that are not three numbers; RangeError for values that are not finite, a field of
+        view outside (0, 180), a target equal to the eye, or an `up` along the view.
     """
 
     eye: Vector
@@ -64,8 +64,8 @@ class Scene:
         faces: (F, 3) rows of `vertices`, F > 0; stored as read-only int64.
         cameras: the views it is seen from, at least one.
         radius: suggested ambient-occlusion radius in scene units, > 0.
-    Raises: SceneError for a mesh without faces or with NaN or infinite vertices, faces that name no vertex, no view; RangeError for
-        a radius that is not positive.
+    Raises: SceneError for a mesh without faces or with NaN or infinite vertices, faces that name no vertex, no view;
+        RangeError for a radius that is not positive.
     Cost: the embree scene and the normals are built on first use and kept; pickles and copies leave them behind.
     """
 
@@ -110,7 +110,9 @@ class Scene:
         for index in listed:
             whole = isinstance(index, (int, np.integer)) and not isinstance(index, bool)
             if not whole or not -count <= index < count:
-                raise checks.RangeError(f"views must be indices below {count} of scene {self.name!r}, got {index!r}: use 0 to {count - 1}")
+                raise checks.RangeError(
+                    f"views must be indices below {count} of scene {self.name!r}, got {index!r}: use 0 to {count - 1}"
+                )
         if not listed:
             raise checks.RangeError("views must name at least one view, got none: pass None for all of them")
         return [int(index) % count for index in listed]
@@ -118,17 +120,17 @@ class Scene:
     @property
     def rays(self) -> RayCaster:
         """The mesh as embree sees it, built on first use (thread-safe). Face indices are rows of `faces`."""
-        return self._once("_rays", lambda: RayCaster(self.vertices, self.faces))  # type: ignore[no-any-return]
+        return self._once("_rays", lambda: RayCaster(self.vertices, self.faces))
 
     @property
     def face_normals(self) -> NDArray[np.float64]:
         """(F, 3) unit normals by the winding of each face, zero for faces without area; built on first use."""
-        return self._once("_face_normals", lambda: face_normals(self.vertices, self.faces))  # type: ignore[no-any-return]
+        return self._once("_face_normals", lambda: face_normals(self.vertices, self.faces))
 
     @property
     def corner_normals(self) -> NDArray[np.float64]:
         """(F, 3, 3) unit normals of each face's corners, smooth except over creases; built on first use."""
-        return self._once("_corner_normals", lambda: corner_normals(self.vertices, self.faces))  # type: ignore[no-any-return]
+        return self._once("_corner_normals", lambda: corner_normals(self.vertices, self.faces))
 
     @property
     def diagonal(self) -> float:
@@ -138,8 +140,8 @@ class Scene:
 
     @property
     def fingerprint(self) -> str:
-        """Hash of the mesh and the views (not of the name or the suggested radius): the same pictures, the same string."""
-        return self._once("_fingerprint", self._hash)  # type: ignore[no-any-return]
+        """Hash of the mesh and the views, not of the name or the suggested radius."""
+        return self._once("_fingerprint", self._hash)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Scene):
@@ -183,14 +185,18 @@ def check_mesh(name: str, vertices: NDArray[np.float64], faces: NDArray[np.int64
     if len(vertices) == 0:
         raise checks.SceneError(f"mesh {name!r} must have vertices, got an empty mesh: check how it was exported")
     if len(faces) == 0:
-        raise checks.SceneError(f"mesh {name!r} must have faces, got {len(vertices)} vertices alone: point clouds need meshing first")
+        raise checks.SceneError(
+            f"mesh {name!r} must have faces, got {len(vertices)} vertices alone: point clouds need meshing first"
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise checks.SceneError(
             f"mesh {name!r} must have faces of vertices below {len(vertices)}, got {faces.min()} to {faces.max()}: repair the file"
         )
     bad = int((~np.isfinite(vertices)).any(axis=1).sum())
     if bad:
-        raise checks.SceneError(f"mesh {name!r} must have finite vertices, got {bad} with NaN or inf: repair or remove them")
+        raise checks.SceneError(
+            f"mesh {name!r} must have finite vertices, got {bad} with NaN or inf: repair or remove them"
+        )
 
 
 def _frozen(array: Any, dtype: Any) -> NDArray[Any]:
@@ -200,7 +206,11 @@ def _frozen(array: Any, dtype: Any) -> NDArray[Any]:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float, np.floating, np.integer)) and not isinstance(value, bool) and math.isfinite(value)
+    return (
+        isinstance(value, (int, float, np.floating, np.integer))
+        and not isinstance(value, bool)
+        and math.isfinite(value)
+    )
 
 
 def _vector(name: str, value: Any) -> Vector:

@@ -18,7 +18,9 @@ def import_trimesh() -> Any:
     try:
         import trimesh
     except ImportError as error:
-        raise checks.SceneError("scenes need trimesh, which is not installed: pip install torch_ssao[scenes]") from error
+        raise checks.SceneError(
+            "scenes need trimesh, which is not installed: pip install torch_ssao[scenes]"
+        ) from error
     return trimesh
 
 
@@ -48,7 +50,9 @@ class Builder:
         part = self._trimesh.creation.box(extents=high_corner - low_corner)
         self.add(_turned(part.vertices, turn_deg) + (low_corner + high_corner) / 2, part.faces)
 
-    def wall(self, low: Point, high: Point, holes: Sequence[tuple[float, float, float, float]], *, axis: int = 0) -> None:
+    def wall(
+        self, low: Point, high: Point, holes: Sequence[tuple[float, float, float, float]], *, axis: int = 0
+    ) -> None:
         """Box with rectangular openings, none of which overlap along the wall.
 
         `holes` are (start, stop, bottom, top) along `axis` (0 = x, 2 = z) and y, in world coordinates.
@@ -61,7 +65,9 @@ class Builder:
             at = stop
         self._slab(low, high, axis, (at, high[axis]), (low[1], high[1]))
 
-    def rod(self, start: Point, end: Point, radius: float, *, sections: int = 24, end_radius: float | None = None) -> None:
+    def rod(
+        self, start: Point, end: Point, radius: float, *, sections: int = 24, end_radius: float | None = None
+    ) -> None:
         """Capped cylinder, or cone frustum, between two points."""
         a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
         axis = (b - a) / np.linalg.norm(b - a)

@@ -1,0 +1,102 @@
+"""Scan, Levenberg-Marquardt from the best points of the scan, polish: one search within one budget."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torch_ssao.fitting import bridge
+from torch_ssao.fitting.parameters import ParameterSpace
+from torch_ssao.fitting.polish import polish
+from torch_ssao.fitting.residuals import BudgetSpent, Residuals
+from torch_ssao.fitting.scan import scan
+
+PERFECT = 1e-6  # RMSE at which float32 images agree: nothing is left to fit
+PATIENCE = 3  # visits without a relative gain of WORTH after which a descent has stalled
+WORTH = 1e-3
+FIRST_DAMPING = 1e-2  # of the largest diagonal entry of J'J, Marquardt's tau
+APART = 0.7  # distance in logarithms below which two scan points lead to the same place
+POLISH_ROUNDS = 6  # rounds of evaluations kept back for the polish
+STARTS = 4
+
+
+@final
+@dataclass(frozen=True)
+class Outcome:
+    """How a search went: descents begun, steps that lowered the error, whether the last difference was as small as it gets."""
+
+    starts: int
+    steps: int
+    converged: bool
+
+
+def search(residuals: Residuals, space: ParameterSpace, *, with_scan: bool) -> Outcome:
+    """Find the least |r| within the budget; the best point stays in `residuals`."""
+    candidates = scan(residuals, space) if with_scan else [space.start]
+    reserve = min(POLISH_ROUNDS * (len(space) + 1), residuals.left // 2)
+    tried: list[Tensor] = []
+    steps = 0
+    for candidate in candidates:
+        if len(tried) == STARTS or residuals.rmse < PERFECT or (tried and residuals.left < reserve + 3 * (len(space) + 1)):
+            break
+        if any(float((candidate - other).norm()) < APART for other in tried):
+            continue
+        tried.append(candidate)
+        steps += _Descent(residuals, space, reserve).run(candidate)
+    refined, converged = polish(residuals, space)
+    return Outcome(len(tried), steps + refined, converged)
+
+
+@final
+class _Descent:
+    """One Levenberg-Marquardt run: what optimistix visits, and when it is told to stop."""
+
+    def __init__(self, residuals: Residuals, space: ParameterSpace, reserve: int) -> None:
+        self.residuals, self.space, self.reserve = residuals, space, reserve
+        self.least = math.inf
+        self.scale = 0.0
+        self.stalled = 0
+        self.steps = -1  # the first visit is no step
+
+    def run(self, start: Tensor) -> int:
+        bridge.levenberg_marquardt(self._visit, self.space.from_log(start).numpy())
+        return max(self.steps, 0)
+
+    def _visit(self, at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Residuals and Jacobian reduced to P + 1 rows: the R of a QR of [J r] has the same J'J, J'r and |r|, so that every step
+        of the solver is the same as with all N rows."""
+        u = torch.from_numpy(at)
+        log = self.space.to_log(u)
+        if self.residuals.left < self.reserve + 1 + len(self.space):
+            raise bridge.StopSolver
+        try:
+            residual = self.residuals.value(log)
+            norm = float(residual.norm())
+            self.stalled = 0 if norm < self.least * (1 - WORTH) else self.stalled + 1
+            if self.stalled == PATIENCE or norm < PERFECT or not math.isfinite(norm):
+                raise bridge.StopSolver
+            if norm >= self.least * (1 - 1e-12):  # surely rejected: its Jacobian is never looked at
+                reduced = np.zeros((len(at) + 1, len(at) + 1))
+                reduced[-1, -1] = norm * self.scale
+            else:
+                self.least, self.steps = norm, self.steps + 1
+                reduced = self._reduce(residual, self.residuals.jacobian(log) * self.space.slope(u).to(residual.device))
+        except BudgetSpent as spent:
+            raise bridge.StopSolver from spent
+        return reduced[:, -1], reduced[:, :-1]
+
+    def _reduce(self, residual: Tensor, jacobian: Tensor) -> NDArray[np.float64]:
+        if not self.scale:  # optimistix starts with a damping of 1: scaled, that is FIRST_DAMPING of J'J
+            largest = float(jacobian.square().sum(0).max())
+            self.scale = 1 / math.sqrt(max(FIRST_DAMPING * largest, 1e-30))
+        stacked = torch.cat((jacobian, residual[:, None]), 1)
+        stacked = torch.nn.functional.pad(stacked, (0, 0, 0, max(0, stacked.shape[1] - len(stacked))))
+        upper = torch.linalg.qr(stacked, mode="r").R
+        upper = upper * torch.where(upper.diagonal() < 0, -1.0, 1.0)[:, None]  # unique, hence comparable from step to step
+        return (self.scale * upper).cpu().numpy()
