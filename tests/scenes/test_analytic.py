@@ -146,7 +146,14 @@ def test_exact_against_ray_casting_at_pixels(name: str) -> None:
             # Start a hair above the surface, as the independent caster knows nothing of which surface it stands on.
             start = points[row, column] + 1e-7 * normals[row, column]
             cast = mc.visibility(
-                start, normals[row, column], _occluders(name), radius=radius, falloff=falloff, weighting=weighting, seed=int(row), log2_rays=16
+                start,
+                normals[row, column],
+                _occluders(name),
+                radius=radius,
+                falloff=falloff,
+                weighting=weighting,
+                seed=int(row),
+                log2_rays=16,
             )
             assert visibility[0, 0, row, column].item() == pytest.approx(cast, abs=4e-4)
 
@@ -319,11 +326,19 @@ def test_errors_name_argument_and_remedy() -> None:
         (checks.RangeError, "span must be finite", lambda: scene.camera(4, 4, span=0.0)),
         (checks.RangeError, "extent must be finite", lambda: scene.mesh(0.0)),
         (checks.RangeError, "segments must be a whole number", lambda: scene.mesh(1.0, segments=3)),
-        (checks.DtypeError, "dtype must be floating point", lambda: scene.render(scene.camera(4, 4), dtype=torch.int32)),
+        (
+            checks.DtypeError,
+            "dtype must be floating point",
+            lambda: scene.render(scene.camera(4, 4), dtype=torch.int32),
+        ),
         (checks.RangeError, "radius must be greater than 0", lambda: scene.exact(gbuffer, radius=-1.0)),
         (checks.ChoiceError, "falloff must be one of", lambda: scene.exact(gbuffer, falloff="cubic")),
         (checks.ChoiceError, "weighting must be one of", lambda: scene.exact(gbuffer, weighting="solid")),
-        (checks.ChoiceError, "falloff must be 'binary'", lambda: scene.exact(gbuffer, falloff="linear", weighting="volumetric")),
+        (
+            checks.ChoiceError,
+            "falloff must be 'binary'",
+            lambda: scene.exact(gbuffer, falloff="linear", weighting="volumetric"),
+        ),
     ]
     for error, message, call in bad:
         with pytest.raises(error, match=message):

@@ -17,7 +17,9 @@ def hemisphere(normal: Sequence[float], weighting: str, seed: int, log2_rays: in
     """Scrambled Sobol directions (N, 3) about a unit normal, distributed by cosine or by solid angle."""
     a, b = qmc.Sobol(2, scramble=True, rng=np.random.default_rng(seed)).random_base2(log2_rays).T
     rise = np.sqrt(1.0 - a) if weighting == "cosine" else 1.0 - a
-    local = np.stack((np.sqrt(1.0 - rise**2) * np.cos(2 * np.pi * b), np.sqrt(1.0 - rise**2) * np.sin(2 * np.pi * b), rise), axis=1)
+    local = np.stack(
+        (np.sqrt(1.0 - rise**2) * np.cos(2 * np.pi * b), np.sqrt(1.0 - rise**2) * np.sin(2 * np.pi * b), rise), axis=1
+    )
     n = np.asarray(normal, np.float64)
     n = n / np.linalg.norm(n)
     tangent = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])

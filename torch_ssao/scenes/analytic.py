@@ -24,7 +24,11 @@ from torch_ssao.scenes.primitives import Array, Patch, Sphere
 
 _FAR = 1e4  # in spans: what lies deeper is background, so that rays along a plane's horizon do not reach 1e16
 _ON_SURFACE = 1e-4  # of the depth: a float32 depth, or a finely tessellated sphere, still counts as on its surface
-_AZIMUTH = (0.8, -0.6, 0.0)  # default cameras stand in front of the wall and to the side, so that nothing is axis-aligned
+_AZIMUTH = (
+    0.8,
+    -0.6,
+    0.0,
+)  # default cameras stand in front of the wall and to the side, so that nothing is axis-aligned
 
 
 class Question(TypedDict):
@@ -81,11 +85,15 @@ class AnalyticScene:
         Raises: RangeError.
         """
         if not 0 <= view_angle_deg < 90:
-            raise checks.RangeError(f"view_angle_deg must lie in [0, 90), got {view_angle_deg!r}: measure it from the normal")
+            raise checks.RangeError(
+                f"view_angle_deg must lie in [0, 90), got {view_angle_deg!r}: measure it from the normal"
+            )
         span = self.span if span is None else span
         checks.check_positive("span", span)
         if not 0 < fov_y_deg < 180:
-            raise checks.RangeError(f"fov_y_deg must lie in (0, 180) degrees, got {fov_y_deg!r}: pass degrees, not radians")
+            raise checks.RangeError(
+                f"fov_y_deg must lie in (0, 180) degrees, got {fov_y_deg!r}: pass degrees, not radians"
+            )
         tangent = math.tan(math.radians(fov_y_deg) / 2)
         sine, cosine = math.sin(math.radians(view_angle_deg)), math.cos(math.radians(view_angle_deg))
         focus, azimuth, z = (torch.tensor(v, dtype=torch.float64) for v in (self.focus, _AZIMUTH, (0.0, 0.0, 1.0)))
@@ -101,7 +109,9 @@ class AnalyticScene:
         right, aspect = pose[0, :3], width / height
         corners = torch.stack([i * aspect * right + j * up for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
         room = float(self._first_hit(eye, corners, start=1e-9 * span)[0].min())
-        return Camera.orthographic(min(span, 1.8 * room) * torch.ones(1, dtype=torch.float64), height, width, world_to_view=pose)
+        return Camera.orthographic(
+            min(span, 1.8 * room) * torch.ones(1, dtype=torch.float64), height, width, world_to_view=pose
+        )
 
     def render(self, camera: Camera, *, dtype: torch.dtype = torch.float64) -> GBuffer:
         """Exact G-buffer by ray/primitive intersection in float64.

@@ -45,9 +45,7 @@ def plane(*, radius: float = math.inf, falloff: str = "binary", weighting: str =
     return np.ones(())
 
 
-def wall(
-    distance: ArrayLike, *, radius: float = math.inf, falloff: str = "binary", weighting: str = "cosine"
-) -> Array:
+def wall(distance: ArrayLike, *, radius: float = math.inf, falloff: str = "binary", weighting: str = "cosine") -> Array:
     """Visibility on a floor at `distance` from an infinite perpendicular wall.
 
     With s = distance / R, occlusion is, for cosine weights and binary, linear, quadratic falloff,
@@ -64,7 +62,9 @@ def wall(
     return 1.0 - occlusion
 
 
-def ceiling(height: ArrayLike, *, radius: float = math.inf, falloff: str = "binary", weighting: str = "cosine") -> Array:
+def ceiling(
+    height: ArrayLike, *, radius: float = math.inf, falloff: str = "binary", weighting: str = "cosine"
+) -> Array:
     """Visibility on a floor under an infinite parallel plate at `height`.
 
     With s = height / R < 1, occlusion is, for cosine weights and binary, linear, quadratic falloff, 1 - s^2, (1 - s)^2,
@@ -140,9 +140,7 @@ def dihedral(
     concave = angle < 180.0
     beta = np.radians(np.where(concave, angle, 90.0))
     distance = _non_negative("distance", distance)
-    inside = half_space(
-        distance * np.sin(beta), np.cos(beta), radius=radius, falloff=falloff, weighting=weighting
-    )
+    inside = half_space(distance * np.sin(beta), np.cos(beta), radius=radius, falloff=falloff, weighting=weighting)
     return np.where(concave, inside, 1.0)
 
 
@@ -225,7 +223,9 @@ def sphere(
     """
     kernel, exponent = check_question(radius, falloff, weighting, volumetric=False)
     d, tilt, r = np.broadcast_arrays(
-        _non_negative("distance", distance), _cosine("cos_angle", cos_angle), _non_negative("sphere_radius", sphere_radius)
+        _non_negative("distance", distance),
+        _cosine("cos_angle", cos_angle),
+        _non_negative("sphere_radius", sphere_radius),
     )
     if not bool(((r > 0) & (d > r)).all()):
         raise checks.RangeError(
@@ -290,9 +290,7 @@ def spherical_cap(cos_half_angle: ArrayLike, cos_tilt: ArrayLike, *, weighting: 
     return 1.0 - _cap(cos_half, _cosine("cos_tilt", cos_tilt), kernel)
 
 
-def check_question(
-    radius: float, falloff: str, weighting: str, *, volumetric: bool = True
-) -> tuple[str, int | None]:
+def check_question(radius: float, falloff: str, weighting: str, *, volumetric: bool = True) -> tuple[str, int | None]:
     """Check radius, falloff and weighting, and resolve them to a kernel and an exponent.
 
     Args:
@@ -367,7 +365,9 @@ def _attenuated(
     """Integral over t in [0, 1] of binary(t R) p t^(p - 1); `binary` is 0 before the first break and smooth between them."""
     if exponent is None or math.isinf(radius):
         return binary(radius)
-    edges = np.sort(np.stack([np.clip(b, 1e-14, 1.0) for b in (*np.broadcast_arrays(*breaks), 1.0 + 0.0 * breaks[0])]), axis=0)
+    edges = np.sort(
+        np.stack([np.clip(b, 1e-14, 1.0) for b in (*np.broadcast_arrays(*breaks), 1.0 + 0.0 * breaks[0])]), axis=0
+    )
     total = np.zeros(edges.shape[1:])
     for low, high in itertools.pairwise(edges):
         span = np.log(high / low)

@@ -76,7 +76,9 @@ class Patch:
         cuts = []
         for axis, (low, high) in ((u, self.u_range), (v, self.v_range)):
             middle = min(max(float((centre - origin) @ axis), low), high)
-            cuts.append((low if math.isfinite(low) else middle - extent, high if math.isfinite(high) else middle + extent))
+            cuts.append(
+                (low if math.isfinite(low) else middle - extent, high if math.isfinite(high) else middle + extent)
+            )
         (a, b), (c, d) = cuts
         corners = [origin + p * u + q * v for p, q in ((a, c), (b, c), (b, d), (a, d))]
         return np.stack(corners), np.array([[0, 1, 2], [0, 2, 3]], np.int64)
@@ -122,7 +124,11 @@ class Sphere:
         polar = np.pi * np.arange(1, rings) / rings
         turn = 2.0 * np.pi * np.arange(segments) / segments
         ring = np.stack(
-            (np.outer(np.sin(polar), np.cos(turn)), np.outer(np.sin(polar), np.sin(turn)), np.outer(np.cos(polar), np.ones(segments))),
+            (
+                np.outer(np.sin(polar), np.cos(turn)),
+                np.outer(np.sin(polar), np.sin(turn)),
+                np.outer(np.cos(polar), np.ones(segments)),
+            ),
             axis=-1,
         ).reshape(-1, 3)
         unit = np.concatenate(([[0.0, 0.0, 1.0]], ring, [[0.0, 0.0, -1.0]]))
