@@ -19,7 +19,7 @@ from typing import Any
 import torch
 
 import torch_ssao as ts
-from torch_ssao.report.environment import describe
+from torch_ssao.report.environment import environment
 
 SIZES = ((512, 384), (1280, 720))
 LAYERS = (1, 2, 4, 8)
@@ -81,10 +81,12 @@ def main() -> None:
     ]
     print(f"{'size':>10} {'layers':>6} {'window':>6}  forward ms            forward + backward ms")
     for r in rows:
-        shown = [f"{t['median_ms']:8.1f} [{t['q1_ms']:.1f}, {t['q3_ms']:.1f}]" for t in (r["forward"], r["forward_backward"])]
+        shown = [
+            f"{t['median_ms']:8.1f} [{t['q1_ms']:.1f}, {t['q3_ms']:.1f}]" for t in (r["forward"], r["forward_backward"])
+        ]
         print(f"{r['width']}x{r['height']:<5} {r['layers']:>6} {r['footprint_px']:>6}  {shown[0]:<21} {shown[1]}")
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps({"environment": describe(), "rows": rows}, indent=2) + "\n", encoding="utf-8")
+    options.out.write_text(json.dumps({"environment": environment(), "rows": rows}, indent=2) + "\n", encoding="utf-8")
     print(f"wrote {options.out}")
 
 

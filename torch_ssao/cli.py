@@ -100,7 +100,7 @@ def render_command(arguments: argparse.Namespace) -> None:
     if module is None:
         module = rows.candidates("statvo", radius, (4 if arguments.layers is None else arguments.layers,))[0][2]
     width, height = arguments.size
-    out = _out(arguments, scene)
+    out = checks.check_output_folder("out", _out(arguments, scene))
     settings = truth.TraceSettings(height, width, radius, arguments.samples)
     for view in views:
         gbuffer = scenes.render(scene, views=view, height=height, width=width)
@@ -189,10 +189,7 @@ def _module(arguments: argparse.Namespace) -> AmbientVisibility:
 
 
 def _out(arguments: argparse.Namespace, scene: Scene) -> Path:
-    from torch_ssao import checks
-
-    folder = Path("out") / scene.name if arguments.out is None else arguments.out
-    return checks.check_output_folder("--out", folder)
+    return Path("out") / scene.name if arguments.out is None else arguments.out
 
 
 def _write_picture(path: Path, content: bytes) -> None:
@@ -239,7 +236,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Screen-space ambient occlusion: pictures, fits to ray-traced references, reports.",
     )
     parser.add_argument("--version", action="version", version=f"torch-ssao {__version__}")
-    commands = parser.add_subparsers(title="commands", required=True, metavar="scenes|render|fit|report")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_scenes(commands)
     _add_render(commands)
     for name, function, text in (

@@ -23,7 +23,8 @@ WORTH = 1e-3
 FIRST_DAMPING = 1e-2  # of the largest diagonal entry of J'J, Marquardt's tau
 APART = 0.7  # distance in logarithms below which two scan points lead to the same place
 POLISH_ROUNDS = 6  # rounds of evaluations kept back for the polish
-STARTS = 4
+STARTS = 8
+SAME = 5e-3  # two descents that end within this part of each other's RMSE found the same minimum
 
 
 @final
@@ -41,16 +42,25 @@ def search(residuals: Residuals, space: ParameterSpace, *, with_scan: bool) -> O
     candidates = scan(residuals, space) if with_scan else [space.start]
     reserve = min(POLISH_ROUNDS * (len(space) + 1), residuals.left // 2)
     tried: list[Tensor] = []
+    ends: list[float] = []
     steps = 0
     for candidate in candidates:
-        if len(tried) == STARTS or residuals.rmse < PERFECT or (tried and residuals.left < reserve + 3 * (len(space) + 1)):
+        exhausted = len(tried) == STARTS or (tried and residuals.left < reserve + 3 * (len(space) + 1))
+        if exhausted or residuals.rmse < PERFECT or _found_twice(ends):
             break
         if any(float((candidate - other).norm()) < APART for other in tried):
             continue
         tried.append(candidate)
-        steps += _Descent(residuals, space, reserve).run(candidate)
+        descent = _Descent(residuals, space, reserve)
+        steps += descent.run(candidate)
+        ends.append(descent.least)
     refined, converged = polish(residuals, space)
     return Outcome(len(tried), steps + refined, converged)
+
+
+def _found_twice(ends: list[float]) -> bool:
+    """Whether two descents from different starts ended at the least error: a third would hardly find less."""
+    return sum(end <= min(ends) * (1 + SAME) for end in ends) >= 2 if ends else False
 
 
 @final

@@ -92,7 +92,7 @@ class _StatVO(torch.autograd.Function):
         for leaf in frame.leaves(labels, layers):
             total = total + leaf.amount * leaf.value
             count = count + leaf.amount
-        obscurance = torch.where(frame.seen & (count > 0), total / count.clamp(min=MIN_COUNT), 0.0)
+        obscurance = torch.where(frame.seen & (count > 0), total / count.clamp(min=MIN_COUNT), 0.0).clamp(max=1)
         return obscurance.view_as(points[:, 0, 0]).to(points.dtype), labels, count
 
     @staticmethod

@@ -24,10 +24,14 @@ TILE_RAYS = 1 << 17
 """Rays of a tile of pixels, per thread: about 10 MB of arrays. Results do not depend on it."""
 
 OFFSET = 1e-5
-"""Start of the rays above the surface, as a fraction of the radius: corners change by less than 1e-5 of visibility."""
+"""Start of the rays above the surface, as a fraction of the radius. Means over real scenes (sibenik, sponza, bunny, teapot,
+a tree) move by under 1e-5 from a third of it to all of it, and by 7e-5 to ten times it; at a tenth of it sponza's doubled
+faces, two millionths of the radius apart after rounding, hide a thirtieth of the pixels."""
 
 ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
-"""Least start above the surface, as a fraction of the largest coordinate. Origin, vertices and embree's arithmetic are float32."""
+"""Least start above the surface, as a fraction of the largest coordinate: origins, vertices and embree's arithmetic are
+float32. On 60 planes of random tilt, size and place, seen at up to 86 degrees, pixels hide themselves when it is half
+an epsilon and none does at one."""
 
 _WORST_OFFSET = 0.01  # of the radius; beyond it rounding would bias the answer
 
@@ -45,10 +49,10 @@ def raytrace(
     progress: bool | None = None,
     threads: int | None = None,
 ) -> Reference:
-    """Cosine-weighted visibility of the surfaces that the pixels of some views see: 1 - mean of W(distance / radius) over the hits.
+    """Cosine-weighted visibility of the surfaces that some views see: 1 - the mean of W(hit distance / radius) over rays.
 
-    Rays leave the pixel centre's surface point about the geometric normal that faces the eye; faces are two-sided, smooth
-    normals play no part. W(t) = 1 for "binary", 1 - t for "linear", 1 - t^2 for "quadratic"; distances are those of the hits.
+    Rays leave the pixel centre's surface point about the geometric normal that faces the eye; faces are two-sided and
+    smooth normals play no part. W(t) = 1 for "binary", 1 - t for "linear", 1 - t^2 for "quadratic"; 0 without a hit.
 
     Args:
         scene: the mesh and its views.
@@ -61,10 +65,10 @@ def raytrace(
         progress: show a bar on stderr; None for only when that is a terminal.
         threads: threads to use; None for every core this process may run on.
     Returns: a Reference; pixels that see nothing have visibility 1 and standard error 0.
-    Raises: RangeError for a radius, size, seed, view or sample count outside its range, or a radius too short for float32
-        coordinates; ChoiceError for an unknown falloff; SceneError for a view that sees nothing.
-    Cost: 2 to 6 million rays a second and core by scene (512x384 at 512 samples: about 100 million rays); memory is
-        20 MB a thread and 150 bytes a pixel of one view.
+    Raises: RangeError for a radius, size, seed, view or sample count outside its range, or a radius too short for
+        float32 coordinates; ChoiceError for an unknown falloff; SceneError for a view that sees nothing.
+    Cost: 8 to 13 million rays a second and core (sibenik, bunny), ray generation included; memory is MEMTHREAD a thread
+        and MEMPIXEL a pixel, whatever the samples.
     Source: hemisphere sampling by Malley's method; see `reference.sampling` for the points and the standard error.
     """
     checks.check_count("height", height, 1)
@@ -93,8 +97,18 @@ def raytrace(
                 visibility[row, tile], error[row, tile] = answer
                 bar.add(len(tile))
     shape = (len(indices), 1, height, width)
-    images = (torch.from_numpy(image.reshape(shape)) for image in (visibility, error, valid))
-    return Reference(*images, samples, float(radius), falloff, seed, scene.name, scene.fingerprint, tuple(indices))
+    return Reference(
+        visibility=torch.from_numpy(visibility.reshape(shape)),
+        standard_error=torch.from_numpy(error.reshape(shape)),
+        valid=torch.from_numpy(valid.reshape(shape)),
+        samples=samples,
+        radius=float(radius),
+        falloff=falloff,
+        seed=seed,
+        scene=scene.name,
+        fingerprint=scene.fingerprint,
+        views=tuple(indices),
+    )
 
 
 class _Tracer:
@@ -139,8 +153,8 @@ def _offset(scene: Scene, radius: float) -> float:
     offset = max(OFFSET * radius, ROUNDING * reach)
     if offset > _WORST_OFFSET * radius:
         raise checks.RangeError(
-            f"radius must be at least {offset / _WORST_OFFSET:.3g} in scene {scene.name!r}, whose size is {2 * reach:g}, got {radius!r}: "
-            "shorter rays drown in float32 rounding, use a larger radius or a smaller part of the mesh"
+            f"radius must be at least {offset / _WORST_OFFSET:.3g} in scene {scene.name!r} of size {2 * reach:g}, "
+            f"got {radius!r}: shorter rays drown in float32 rounding, use a larger radius or a part of the mesh"
         )
     return offset
 

@@ -9,7 +9,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor
 from torch_ssao import checks
 
 _FORMAT = "torch_ssao reference 1"
+_DAMAGE = (EOFError, KeyError, ValueError, TypeError, AttributeError, IndexError, zipfile.BadZipFile, zlib.error)
 _IMAGES = {"visibility": torch.float32, "standard_error": torch.float32, "valid": torch.bool}
 
 
@@ -28,8 +29,8 @@ class Reference:
 
     Args:
         visibility: (B, 1, H, W) float32 in [0, 1], 1 = open; 1 where nothing is seen.
-        standard_error: (B, 1, H, W) float32, of each pixel's visibility; its square is unbiased, so take the root of a mean of
-            squares over pixels. 0 where nothing is seen.
+        standard_error: (B, 1, H, W) float32, of each pixel's visibility; its square is unbiased, so average squares over
+            pixels, then take the root. 0 where nothing is seen.
         valid: (B, 1, H, W) bool, pixels that see a surface.
         samples: rays a pixel.
         radius: length of the rays in scene units.
@@ -64,7 +65,7 @@ class Reference:
 
     @property
     def noise(self) -> float:
-        """Root mean square of the standard error over valid pixels: the RMSE that even a perfect technique would show."""
+        """Root mean square of the standard error over valid pixels: the RMSE that a perfect technique would show."""
         kept = self.standard_error[self.valid].double()
         return float(kept.square().mean().sqrt()) if kept.numel() else 0.0
 
@@ -94,7 +95,7 @@ def save(result: Reference, path: str | Path) -> None:
         os.replace(temporary, target)
     except OSError as error:
         raise checks.OutputError(
-            f"path {str(target)!r} cannot be written ({error.strerror or error}): choose another file or free some space"
+            f"path {str(target)!r} must be writable, got {error.strerror or error}: choose another file or free some space"
         ) from error
     finally:
         if temporary is not None:
@@ -106,7 +107,7 @@ def load(path: str | Path) -> Reference:
 
     Args:
         path: npz file.
-    Raises: SceneError when the file is missing, truncated or something else.
+    Raises: SceneError when the file is missing, cannot be read, is truncated or is something else.
     """
     source = Path(path)
     try:
@@ -114,11 +115,12 @@ def load(path: str | Path) -> Reference:
             facts = json.loads(str(file["facts"]))
             if facts.pop("format") != _FORMAT:
                 raise KeyError("format")
-            images = {name: torch.from_numpy(file[name]) for name in _IMAGES}
+            images: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _IMAGES}
         return Reference(**images, **(facts | {"views": tuple(facts["views"])}))
-    except FileNotFoundError as error:
-        raise checks.SceneError(f"path {str(source)!r} must be a saved reference, got no such file: check the name") from error
-    except (OSError, EOFError, KeyError, ValueError, TypeError, AttributeError, IndexError, zipfile.BadZipFile, zlib.error) as error:
+    except OSError as error:
+        reason = error.strerror or error
+        raise checks.SceneError(f"path {str(source)!r} must be a saved reference, got {reason}: check the name") from error
+    except _DAMAGE as error:
         raise checks.SceneError(
-            f"path {str(source)!r} must be a reference written by reference.save, got a damaged or foreign file: trace it again"
+            f"path {str(source)!r} must be a file of reference.save, got a damaged or foreign one: trace it again"
         ) from error

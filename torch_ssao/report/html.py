@@ -114,7 +114,8 @@ def _score_notes(measurement: Measurement) -> str:
         f"at {settings.samples} rays a pixel, RMSE = sqrt(mean s²) and PSNR = -20 log10 RMSE. Two references with "
         f"different seeds agree to SSIM {ceiling.ssim_pair:.4f}; only one of the two pictures would be noisy "
         f"if the model were perfect, so SSIM = 1 - (1 - {ceiling.ssim_pair:.4f}) / 2, which holds for small noise. The "
-        f"RMSE of these two references divided by sqrt(2) is {ceiling.rmse_pair:.4f}, a check of the stated {ceiling.rmse:.4f}."
+        f"RMSE of these two references divided by sqrt(2) is {ceiling.rmse_pair:.4f}, a check of the stated "
+        f"{ceiling.rmse:.4f}."
     )
     return f'<p class="soft">{judged} {timed} {noise}</p>'
 

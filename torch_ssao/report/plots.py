@@ -99,7 +99,7 @@ def _draw_parameter(axes: Any, name: str, fitted: list[Row], start: dict[str, di
     spec = fitted[0].module.PARAMETERS[name]
     axes.set_title(name if spec.unit == "1" else f"{name} ({spec.unit})", fontsize=9)
     axes.set_yscale("log")
-    axes.set_ylim(min(drawn) / 1.5, max(drawn) * 1.5)  # wide enough for two ticks however little the values differ
+    axes.set_ylim(min(drawn) / 2.2, max(drawn) * 2.2)  # wide enough for two ticks however little the values differ
     _readable_ticks(axes.yaxis)
     axes.margins(x=0.15)
     axes.set_xticks(range(len(fitted)), [row.label for row in fitted], fontsize=8)

@@ -80,12 +80,7 @@ class RayCaster:
 
         def trace(part: slice) -> None:
             local, along = origins[part] - self.center, np.asarray(directions[part], dtype=np.float64)
-            found = self._scene.run(
-                np.ascontiguousarray(local, dtype=np.float32),
-                np.ascontiguousarray(along, dtype=np.float32),
-                dists=np.ascontiguousarray(reach[part], dtype=np.float32),
-                output=1,
-            )
+            found = self._scene.run(_plain(local), _plain(along), dists=_plain(reach[part]), output=1)
             hit = np.flatnonzero(found["primID"] >= 0)
             face = found["primID"][hit].astype(np.int64)
             triangle[part][hit] = face
@@ -135,8 +130,7 @@ class RayCaster:
         return answer
 
     def _run(self, origins: Float32, directions: Float32, reach: Float32, query: str) -> NDArray[Any]:
-        rays = (np.ascontiguousarray(array, dtype=np.float32) for array in (origins, directions))
-        answer: NDArray[Any] = self._scene.run(*rays, dists=np.ascontiguousarray(reach), query=query)
+        answer: NDArray[Any] = self._scene.run(_plain(origins), _plain(directions), dists=_plain(reach), query=query)
         return answer
 
     def _plane_distance(self, face: Int64, origins: Float64, directions: Float64, embree: Float64) -> Float64:
@@ -148,6 +142,11 @@ class RayCaster:
         exact = np.einsum("ij,ij->i", normal, self._anchor[face] - origins) / np.where(grazing, 1.0, along)
         off = grazing | (np.abs(exact - embree) > 1e-2 * np.abs(embree)) | (exact <= 0)
         return np.where(off, embree, exact)
+
+
+def _plain(array: NDArray[Any]) -> Float32:
+    """As embreex takes it: float32, contiguous and, though it only reads, writable; copied only if need be."""
+    return np.require(array, np.float32, ["C", "W"])
 
 
 def worker_count() -> int:

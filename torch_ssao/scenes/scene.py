@@ -180,7 +180,8 @@ def check_mesh(name: str, vertices: NDArray[np.float64], faces: NDArray[np.int64
     """Raise `SceneError` unless the arrays make a mesh that rays can hit."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise checks.SceneError(
-            f"mesh {name!r} must have vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}: triangulate it"
+            f"mesh {name!r} must have vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}: "
+            "triangulate it"
         )
     if len(vertices) == 0:
         raise checks.SceneError(f"mesh {name!r} must have vertices, got an empty mesh: check how it was exported")
@@ -190,7 +191,8 @@ def check_mesh(name: str, vertices: NDArray[np.float64], faces: NDArray[np.int64
         )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise checks.SceneError(
-            f"mesh {name!r} must have faces of vertices below {len(vertices)}, got {faces.min()} to {faces.max()}: repair the file"
+            f"mesh {name!r} must have faces of vertices below {len(vertices)}, got {faces.min()} to {faces.max()}: "
+            "repair the file"
         )
     bad = int((~np.isfinite(vertices)).any(axis=1).sum())
     if bad:

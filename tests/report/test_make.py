@@ -1,0 +1,139 @@
+"""The finished report: files, pictures, tables and the page."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from support.reports import TINY, corner, fake_fit
+from torch_ssao import checks, fitting
+from torch_ssao.report import Measurement, html, make_report, plots, tables
+from torch_ssao.report import make as make_module
+
+NASTY = 'corner <b>&"'
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Measurement:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitting, "fit", fake_fit, raising=False)
+        return make_report(corner(NASTY), tmp_path_factory.mktemp("out"), **TINY)
+
+
+@pytest.fixture(scope="module")
+def page(made: Measurement) -> str:
+    return (made.out / "report.html").read_text(encoding="utf-8")
+
+
+def test_all_files_are_there_and_listed(made: Measurement) -> None:
+    expected = {"report.html", "report.json", "speed_error.png", "fitted_values.png", "reference.png"}
+    for name in ("statvo_1", "statvo_2"):
+        expected |= {f"{name}.json"}
+        expected |= {f"{name}_{state}{kind}.png" for state in ("untuned", "fitted") for kind in ("", "_error")}
+    assert set(made.files) == expected
+    assert all((made.out / name).is_file() for name in expected)
+    assert json.loads((made.out / "report.json").read_text())["files"] == list(made.files)
+
+
+def test_pictures_hold_the_numbers(made: Measurement) -> None:
+    reference = np.asarray(Image.open(made.out / "reference.png"))
+    assert np.array_equal(reference, np.rint(255 * made.truth.visibility[0, 0].numpy()).astype(np.uint8))
+    for name in made.files:
+        if name.endswith(".png"):
+            with Image.open(made.out / name) as picture:
+                picture.verify()
+
+
+def test_the_page_loads_nothing_from_elsewhere(page: str) -> None:
+    sources = re.findall(r'src="([^"]*)"', page)
+    assert sources
+    for source in sources:
+        assert source.startswith("data:image/png;base64,")
+        Image.open(io.BytesIO(base64.b64decode(source.partition(",")[2]))).verify()
+    rest = re.sub(r'src="[^"]*"', "", page)
+    assert not re.search(r"https?:|url\(|@import|<script|<link|href=", rest)
+
+
+def test_the_page_shows_every_picture_and_row(made: Measurement, page: str) -> None:
+    assert len(re.findall("<img", page)) == sum(name.endswith(".png") for name in made.files)
+    for row in made.rows:
+        assert f"{row.validation.rmse:.4f}" in page
+    assert "noise ceiling" in page
+    assert f"constant {made.constant.value:.3f}" in page
+    assert "linear 8-bit grey" in page
+    assert made.environment["versions"]["torch"] in page
+    assert 'name="viewport"' in page
+
+
+def test_the_page_is_well_formed_and_escapes_names(page: str) -> None:
+    class Check(HTMLParser):
+        open: list[str] = []
+
+        def handle_starttag(self, tag: str, attrs: object) -> None:
+            if tag not in ("meta", "img"):
+                self.open.append(tag)
+
+        def handle_endtag(self, tag: str) -> None:
+            assert self.open.pop() == tag
+
+    check = Check()
+    check.feed(page)
+    assert check.open == []
+    assert "corner &lt;b&gt;&amp;&quot;" in page
+    assert "<b>" not in page
+
+
+def test_a_training_view_is_marked_on_the_page(made: Measurement) -> None:
+    assert "Judged on the training view" not in html.page(made, {})
+    flattered = html.page(replace(made, judged_views=(0,)), {})
+    assert "Judged on the training view" in flattered
+    assert "training view 0" in flattered
+
+
+def test_table_cells(made: Measurement) -> None:
+    cells = tables.score_cells(made)
+    titles = [line[0] for line in cells]
+    assert titles[:4] == ["1 layer, untuned", "2 layers, untuned", "1 layer, fitted", "2 layers, fitted"]
+    assert titles[-1] == "noise ceiling"
+    assert all(len(line) == len(tables.COLUMNS) for line in cells)
+    by_parameter = {(line[0], line[1]): line[3] for line in tables.value_cells(made)}
+    assert by_parameter["1 layer", "radius"] == "± 0.01"
+    assert by_parameter["1 layer", "falloff"] == tables.UNDETERMINED
+    head, matrix = tables.value_matrix(made)
+    assert head == ["fitted values", "radius", "height", "falloff", "contrast"]
+    assert matrix[0][3] == "1 (undetermined)"
+
+
+def test_text_table_lines_up() -> None:
+    lines = tables.text_table(("a", "bb"), [["long name", "1"], ["x", "1000"]]).splitlines()
+    assert lines == ["a            bb", "---------  ----", "long name     1", "x          1000"]
+    assert tables.number(float("nan"), 2) == "-"
+    assert tables.number(float("inf"), 2) == "inf"
+
+
+def test_plots_are_pictures_and_come_without_fits_too(made: Measurement) -> None:
+    untuned = replace(made, rows=made.rows[:2])
+    for content in (plots.speed_error_png(made), plots.speed_error_png(untuned), plots.fitted_values_png(made)):
+        assert content is not None
+        assert min(Image.open(io.BytesIO(content)).size) > 300
+    assert plots.fitted_values_png(untuned) is None
+    assert "<h2>Fitted values" in html.page(untuned, make_module.draw(untuned))
+
+
+def test_without_matplotlib_nothing_is_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(caller: str, extra: str, *modules: str) -> None:
+        raise checks.MissingExtraError(f"{caller} needs {modules[0]}")
+
+    monkeypatch.setattr(make_module, "require", refuse)
+    with pytest.raises(checks.MissingExtraError, match="make_report needs matplotlib"):
+        make_report(corner(), tmp_path / "out", **TINY)
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from support.reports import TINY, corner, fake_fit
+from torch_ssao import checks, fitting, load, reference, scenes
+from torch_ssao.report import Measurement, measure
+from torch_ssao.report.rows import predict, score
+
+
+@pytest.fixture(autouse=True)
+def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fitting, "fit", fake_fit, raising=False)
+
+
+@pytest.fixture
+def no_tracing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: Any, **options: Any) -> None:
+        raise AssertionError("traced")
+
+    monkeypatch.setattr(reference, "raytrace", refuse)
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Measurement:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitting, "fit", fake_fit, raising=False)
+        return measure(corner(views=3), tmp_path_factory.mktemp("out"), **TINY)
+
+
+def test_views_are_judged_that_were_not_fitted(measured: Measurement) -> None:
+    assert (measured.fit_views, measured.judged_views) == ((0,), (1, 2))
+    assert not measured.judged_on_training_views
+    assert measured.judged_label == "views 1, 2"
+    gbuffer = scenes.render(corner(views=3), views=[1, 2], height=36, width=48)
+    for row in measured.rows:
+        assert row.validation == score(predict(row.module, gbuffer), measured.truth)
+        assert row.training != row.validation
+
+
+def test_untuned_rows_come_first_and_differ_from_the_default_in_the_radius_alone(measured: Measurement) -> None:
+    assert [(row.name, row.is_fitted) for row in measured.rows] == [
+        ("statvo_1", False),
+        ("statvo_2", False),
+        ("statvo_1", True),
+        ("statvo_2", True),
+    ]
+    for row in measured.rows[:2]:
+        assert row.module.values() == pytest.approx({"radius": 0.5, "height": 1.0, "falloff": 1.0, "contrast": 1.0})
+
+
+def test_constant_and_ceiling(measured: Measurement) -> None:
+    assert measured.constant.training.rmse > measured.ceiling.rmse > 0
+    assert 0 < measured.constant.value < 1
+
+
+def test_the_json_says_everything(measured: Measurement) -> None:
+    record = json.loads((measured.out / "report.json").read_text())
+    assert record == measured.as_dict()
+    assert record["scene"]["name"] == "corner"
+    assert record["settings"]["samples"] == 16
+    assert record["environment"]["threads"] == torch.get_num_threads()
+    for row in record["rows"]:
+        assert set(row["timing"]) == {"median_ms", "low_ms", "high_ms", "repeats"}
+        assert set(row["validation"]) == {"rmse", "psnr", "ssim"}
+    assert record["rows"][2]["fit"]["undetermined"] == ["falloff"]
+    assert all((measured.out / name).is_file() for name in record["files"])
+
+
+def test_fitted_modules_are_saved(measured: Measurement) -> None:
+    for row in measured.rows[2:]:
+        assert load(measured.out / f"{row.name}.json").values() == row.module.values()
+
+
+def test_a_single_view_is_marked_as_a_training_view(tmp_path: Path) -> None:
+    measured = measure(corner(views=1), tmp_path, **TINY | {"layers": (1,)})
+    assert measured.judged_views == measured.fit_views == (0,)
+    assert measured.judged_on_training_views
+    assert measured.judged_label == "training view 0"
+    assert measured.rows[1].validation == measured.rows[1].training
+    assert json.loads((tmp_path / "report.json").read_text())["judged_on_training_views"] is True
+
+
+def test_chosen_views_radius_and_parameters(tmp_path: Path) -> None:
+    options = TINY | {"layers": (1,), "views": [2], "fit_views": (1, -3), "radius": 0.3, "parameters": ("radius",)}
+    measured = measure(corner(views=3), tmp_path, **options)
+    assert (measured.fit_views, measured.judged_views) == ((1, 0), (2,))
+    assert measured.settings.radius == 0.3
+    assert measured.rows[0].module.values()["radius"] == pytest.approx(0.3)
+    assert set(measured.as_dict()["rows"][1]["fit"]["standard_errors"]) == {"radius"}
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"technique": "magic"}, checks.ChoiceError, "technique must be one of 'statvo'"),
+        ({"views": [7]}, checks.RangeError, "views must be indices below 2"),
+        ({"fit_views": (9,)}, checks.RangeError, "views must be indices below 2"),
+        ({"parameters": ("size",)}, checks.ChoiceError, "parameters must be one of 'radius'"),
+        ({"height": 10}, checks.RangeError, "height must be a whole number at least 11"),
+        ({"radius": 0.0}, checks.RangeError, "radius must be finite and greater than 0"),
+        ({"repeats": 3}, checks.RangeError, "repeats must be a whole number at least 5"),
+        ({"samples": 0}, checks.RangeError, "samples"),
+    ],
+)
+@pytest.mark.usefixtures("no_tracing")
+def test_bad_arguments_are_told_before_anything_is_made(
+    tmp_path: Path, options: dict[str, Any], error: type[ValueError], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        measure(corner(), tmp_path / "out", **TINY | options)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("no_tracing")
+def test_an_output_folder_that_cannot_be_written_is_told_before_any_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(checks.OutputError, match="out .* is not writable"):
+        measure(corner(), tmp_path / "file" / "out", **TINY)
+
+
+def test_what_was_finished_stays_after_an_interruption(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(module: Any, *arguments: Any, **options: Any) -> Any:
+        if module.layers == 2:
+            raise KeyboardInterrupt
+        return fake_fit(module, *arguments, **options)
+
+    monkeypatch.setattr(fitting, "fit", interrupted, raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        measure(corner(), tmp_path, **TINY)
+    assert load(tmp_path / "statvo_1.json").layers == 1
+    assert len(list(tmp_path.glob("reference_*.npz"))) == 3
+    assert not (tmp_path / "report.json").exists()
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_notes_are_told_on_stderr_on_request(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    measure(corner(views=1), tmp_path, **TINY | {"layers": (1,)})
+    assert capsys.readouterr().err == ""
+    measure(corner(views=1), tmp_path, **TINY | {"layers": (1,), "progress": True})
+    assert "fitting 1 layer\ntiming\n" in capsys.readouterr().err
