@@ -120,7 +120,7 @@ def test_bad_arguments_are_told_before_anything_is_made(
 @pytest.mark.usefixtures("no_tracing")
 def test_an_output_folder_that_cannot_be_written_is_told_before_any_work(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(checks.OutputError, match="out .* is not writable"):
+    with pytest.raises(checks.OutputError, match=r"out .* is not writable"):
         measure(corner(), tmp_path / "file" / "out", **TINY)
 
 

@@ -125,7 +125,7 @@ def test_view_angle_is_the_angle_from_the_normal(angle: float) -> None:
 
 @pytest.mark.parametrize("name", BUILDERS)
 def test_exact_against_ray_casting_at_pixels(name: str) -> None:
-    """A few pixels of every surface, both projections, every falloff: visibility by casting rays from the rendered point."""
+    """A few pixels of every scene, both projections, every falloff: rays cast from the rendered point."""
     scene = BUILDERS[name]()
     rng = np.random.default_rng(5)
     for orthographic, (radius, falloff, weighting) in (
@@ -180,7 +180,8 @@ def test_other_sides_are_known() -> None:
     for name in ("plane", "finite wall", "slat", "ceiling", "sphere"):
         scene = BUILDERS[name]()
         visibility, known = scene.exact(scene.render(camera))
-        assert bool(known.all()) and bool((visibility == 1).all()), name
+        assert bool(known.all()), name
+        assert bool((visibility == 1).all()), name
     # From below the floor half-plane of a wedge one stands in the outer angle of 360 - 275 = 85 degrees.
     outside = analytic.dihedral(275.0)
     visibility, known = outside.exact(outside.render(camera))

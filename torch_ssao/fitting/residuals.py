@@ -47,11 +47,14 @@ class Residuals:
         self.best: Tensor | None = None
         self._on_evaluation = on_evaluation
         self._views = []
+        self._kept = []
         for index in range(len(gbuffer)):
             inside = weight[index, 0] > 0
             if bool(inside.any()):
                 wanted = target[index, 0][inside].double()
-                self._views.append((gbuffer[index], inside, wanted, weight[index, 0][inside].double().sqrt()))
+                view = (gbuffer[index], inside, wanted, weight[index, 0][inside].double().sqrt())
+                self._views.append(view)
+                self._kept.append((index, view))
 
     @property
     def left(self) -> int:
@@ -73,22 +76,22 @@ class Residuals:
             ]
         return self._seen(log, torch.cat(parts))
 
-    def jacobian(self, log: Tensor) -> Tensor:
-        """(N, P) derivatives of the residuals to the logarithms. P evaluations. Raises: BudgetSpent.
+    def jacobian(self, log: Tensor, *, counted: bool = True) -> Tensor:
+        """(N, P) derivatives of the residuals to the logarithms. P evaluations. Raises: BudgetSpent, unless not `counted`.
 
         Forward mode with the tangents as a vmapped batch: the primal is computed once for all columns, one view at a time.
         """
-        self._spend(len(self.names))
+        if counted:
+            self._spend(len(self.names))
         columns = []
         with torch.no_grad():
             for gbuffer, inside, _, root in self._views:
                 columns.append(self._push_forward(gbuffer, log)[:, inside].double().T * root[:, None])
         return torch.cat(columns)
 
-    def per_view(self, columns: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Split rows of N pixels into (mask (H, W), rows) of each view."""
-        masks = [inside for _, inside, _, _ in self._views]
-        return list(zip(masks, columns.split([int(mask.sum()) for mask in masks]), strict=True))
+    def gather(self, image: Tensor) -> Tensor:
+        """(N,) the pixels of a (B, 1, H, W) image in the order of the residuals."""
+        return torch.cat([image[index, 0][inside] for index, (_, inside, _, _) in self._kept])
 
     def _predict(self, gbuffer: GBuffer, log: Tensor) -> Tensor:
         """(H, W) visibility with the parameters at `log`."""

@@ -24,7 +24,8 @@ FIRST_DAMPING = 1e-2  # of the largest diagonal entry of J'J, Marquardt's tau
 APART = 0.7  # distance in logarithms below which two scan points lead to the same place
 POLISH_ROUNDS = 6  # rounds of evaluations kept back for the polish
 STARTS = 8
-SAME = 5e-3  # two descents that end within this part of each other's RMSE found the same minimum
+SAME = 5e-3, 0.05  # relative distance in RMSE and distance in logarithms below which two descents found the same minimum
+RUNAWAY = math.log(16.0)  # a descent that moves a parameter by more from the start follows a ridge to infinity
 
 
 @final
@@ -42,7 +43,7 @@ def search(residuals: Residuals, space: ParameterSpace, *, with_scan: bool) -> O
     candidates = scan(residuals, space) if with_scan else [space.start]
     reserve = min(POLISH_ROUNDS * (len(space) + 1), residuals.left // 2)
     tried: list[Tensor] = []
-    ends: list[float] = []
+    ends: list[tuple[float, Tensor]] = []
     steps = 0
     for candidate in candidates:
         exhausted = len(tried) == STARTS or (tried and residuals.left < reserve + 3 * (len(space) + 1))
@@ -53,14 +54,18 @@ def search(residuals: Residuals, space: ParameterSpace, *, with_scan: bool) -> O
         tried.append(candidate)
         descent = _Descent(residuals, space, reserve)
         steps += descent.run(candidate)
-        ends.append(descent.least)
+        ends.append((descent.least, descent.at))
     refined, converged = polish(residuals, space)
     return Outcome(len(tried), steps + refined, converged)
 
 
-def _found_twice(ends: list[float]) -> bool:
+def _found_twice(ends: list[tuple[float, Tensor]]) -> bool:
     """Whether two descents from different starts ended at the least error: a third would hardly find less."""
-    return sum(end <= min(ends) * (1 + SAME) for end in ends) >= 2 if ends else False
+    if not ends:
+        return False
+    least, at = min(ends, key=lambda end: end[0])
+    close = [end <= least * (1 + SAME[0]) and float((log - at).norm()) < SAME[1] for end, log in ends]
+    return sum(close) >= 2
 
 
 @final
@@ -69,7 +74,7 @@ class _Descent:
 
     def __init__(self, residuals: Residuals, space: ParameterSpace, reserve: int) -> None:
         self.residuals, self.space, self.reserve = residuals, space, reserve
-        self.least = math.inf
+        self.least, self.at = math.inf, space.start
         self.scale = 0.0
         self.stalled = 0
         self.steps = -1  # the first visit is no step
@@ -89,13 +94,14 @@ class _Descent:
             residual = self.residuals.value(log)
             norm = float(residual.norm())
             self.stalled = 0 if norm < self.least * (1 - WORTH) else self.stalled + 1
-            if self.stalled == PATIENCE or norm < PERFECT or not math.isfinite(norm):
+            runaway = float((log - self.space.start).abs().max()) > RUNAWAY
+            if self.stalled == PATIENCE or norm < PERFECT or runaway or not math.isfinite(norm):
                 raise bridge.StopSolver
             if norm >= self.least * (1 - 1e-12):  # surely rejected: its Jacobian is never looked at
                 reduced = np.zeros((len(at) + 1, len(at) + 1))
                 reduced[-1, -1] = norm * self.scale
             else:
-                self.least, self.steps = norm, self.steps + 1
+                self.least, self.at, self.steps = norm, log, self.steps + 1
                 reduced = self._reduce(residual, self.residuals.jacobian(log) * self.space.slope(u).to(residual.device))
         except BudgetSpent as spent:
             raise bridge.StopSolver from spent

@@ -24,9 +24,9 @@ TILE_RAYS = 1 << 17
 """Rays of a tile of pixels, per thread: about 10 MB of arrays. Results do not depend on it."""
 
 OFFSET = 1e-5
-"""Start of the rays above the surface, as a fraction of the radius. Means over real scenes (sibenik, sponza, bunny, teapot,
-a tree) move by under 1e-5 from a third of it to all of it, and by 7e-5 to ten times it; at a tenth of it sponza's doubled
-faces, two millionths of the radius apart after rounding, hide a thirtieth of the pixels."""
+"""Start of the rays above the surface, as a fraction of the radius. Means over real scenes (sibenik, sponza, bunny,
+teapot, a tree) move by under 1e-5 from a third of it to all of it, and by 7e-5 to ten times it; at a tenth of it
+sponza's doubled faces, two millionths of the radius apart after rounding, hide a thirtieth of the pixels."""
 
 ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
 """Least start above the surface, as a fraction of the largest coordinate: origins, vertices and embree's arithmetic are
@@ -49,7 +49,7 @@ def raytrace(
     progress: bool | None = None,
     threads: int | None = None,
 ) -> Reference:
-    """Cosine-weighted visibility of the surfaces that some views see: 1 - the mean of W(hit distance / radius) over rays.
+    """Cosine-weighted visibility of the surfaces that some views see: 1 - mean over rays of W(hit distance / radius).
 
     Rays leave the pixel centre's surface point about the geometric normal that faces the eye; faces are two-sided and
     smooth normals play no part. W(t) = 1 for "binary", 1 - t for "linear", 1 - t^2 for "quadratic"; 0 without a hit.
@@ -67,8 +67,8 @@ def raytrace(
     Returns: a Reference; pixels that see nothing have visibility 1 and standard error 0.
     Raises: RangeError for a radius, size, seed, view or sample count outside its range, or a radius too short for
         float32 coordinates; ChoiceError for an unknown falloff; SceneError for a view that sees nothing.
-    Cost: 8 to 13 million rays a second and core (sibenik, bunny), ray generation included; memory is MEMTHREAD a thread
-        and MEMPIXEL a pixel, whatever the samples.
+    Cost: 8 to 13 million rays a second and core (sibenik, bunny), ray generation included; memory is 10 MB a thread
+        and 450 bytes a pixel of one view, whatever the samples.
     Source: hemisphere sampling by Malley's method; see `reference.sampling` for the points and the standard error.
     """
     checks.check_count("height", height, 1)

@@ -1,25 +1,26 @@
 """Cosine-weighted directions for every pixel, arranged so that their own spread gives an unbiased standard error.
 
-The unit square (u: squared radius on the unit disk, v: azimuth) is cut into cells. Each cell of each pixel holds two
-independent Owen-scrambled Sobol' nets: a net of a bank, moved by a random digital (XOR) shift. Every point is uniform in
-its cell, so the mean is unbiased; the two nets of a cell are independent and of one law, so a quarter of the squared
-difference of their means, summed over the cells, estimates the mean's variance without bias, with one degree of freedom
-a cell.
+The unit square (u: squared radius on the unit disk, v: azimuth) is cut into cells. Each cell of each pixel holds
+two independent Owen-scrambled Sobol' nets: a net of a bank, moved by a random digital (XOR) shift. Every point is
+uniform in its cell, so the mean is unbiased; the two nets of a cell are independent and of one law, so a quarter of
+the squared difference of their means, summed over the cells, estimates the mean's variance without bias, with one
+degree of freedom a cell.
 
-Measured against a 16,384-ray truth at 512 rays, 64x48 pixels, binary hits. Ratio: RMS error as a fraction of plain Monte
-Carlo's, on bunny (its second view) / sibenik (first / fourth view).
+Measured against a 16,384-ray truth at 512 rays, 64x48 pixels, binary hits. Ratio: RMS error as a fraction of plain
+Monte Carlo's, on bunny (its second view) / sibenik (first / fourth view).
 
     cells x points a net   1 x 256 (two full nets)   4 x 64          32 x 8 (used here)   256 x 1 (jittered pairs)
     ratio                  .29 / .29 / .29           .29 / .29 / .29   .30 / .31 / .30      .37 / .40 / .38
     stated / measured      1.28 / 1.29 / 1.22 (*)    1.04 / 1.02 / .98 .99 / .99 / .99      1.00 / .97 / .99
     pixels within 3 SE     .998 / .997 / .996        .986 / .975 / .964 .993 / .985 / .982  .999 / .987 / .992
 
-(*) from pairs of points in the same 1/256 of the square, which overlooks what nets gain between cells; the difference
-of the two nets is unbiased but has a single degree of freedom. 32 cells keep nearly all the accuracy. At 16 cells the
-polar map does at least as well as the concentric one (.30 / .30 / .29 against .29 / .32 / .31), and needs no branches.
-Over the six built-in scenes and six real ones (80x60 pixels, two views each) the split used here measures .24 to .32 of
-plain Monte Carlo at 512 rays (.77 to .91 at 8, .17 to .23 at 2,048); stated over measured error is .97 to 1.02, and 98 %
-of the pixels or more lie within 3 of their own standard errors (floored at 1 / (samples + 1)).
+(*) from pairs of points in the same 1/256 of the square, which overlooks what nets gain between cells; the
+difference of the two nets is unbiased but has a single degree of freedom. 32 cells keep nearly all the accuracy. At
+16 cells the polar map does at least as well as the concentric one (.30 / .30 / .29 against .29 / .32 / .31), and
+needs no branches. Over the six built-in scenes and six real ones (80x60 pixels, two views each) the split used here
+measures .24 to .32 of plain Monte Carlo at 512 rays (.77 to .91 at 8, .17 to .23 at 2,048); stated over measured
+error is .97 to 1.02, and 98 % of the pixels or more lie within 3 of their own standard errors (floored at 1 /
+(samples + 1)).
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ class Reference:
 
     Args:
         visibility: (B, 1, H, W) float32 in [0, 1], 1 = open; 1 where nothing is seen.
-        standard_error: (B, 1, H, W) float32, of each pixel's visibility; its square is unbiased, so average squares over
-            pixels, then take the root. 0 where nothing is seen.
+        standard_error: (B, 1, H, W) float32, of each pixel's visibility; its square is unbiased, so average squares
+            over pixels, then take the root. 0 where nothing is seen.
         valid: (B, 1, H, W) bool, pixels that see a surface.
         samples: rays a pixel.
         radius: length of the rays in scene units.
@@ -95,7 +95,7 @@ def save(result: Reference, path: str | Path) -> None:
         os.replace(temporary, target)
     except OSError as error:
         raise checks.OutputError(
-            f"path {str(target)!r} must be writable, got {error.strerror or error}: choose another file or free some space"
+            f"path {str(target)!r} must be writable, got {error.strerror or error}: choose another or free some space"
         ) from error
     finally:
         if temporary is not None:
@@ -119,7 +119,9 @@ def load(path: str | Path) -> Reference:
         return Reference(**images, **(facts | {"views": tuple(facts["views"])}))
     except OSError as error:
         reason = error.strerror or error
-        raise checks.SceneError(f"path {str(source)!r} must be a saved reference, got {reason}: check the name") from error
+        raise checks.SceneError(
+            f"path {str(source)!r} must be a saved reference, got {reason}: check the name"
+        ) from error
     except _DAMAGE as error:
         raise checks.SceneError(
             f"path {str(source)!r} must be a file of reference.save, got a damaged or foreign one: trace it again"

@@ -2,16 +2,17 @@
 
 Every function returns visibility in [0, 1] (1 = open) as float64, broadcasts over its array arguments, and takes
     radius: R > 0 in scene units, inf allowed; only occluders nearer than R count.
-    falloff: the attenuation W(t), t = distance / R, of an occluder: "binary" 1, "linear" 1 - t, "quadratic" 1 - t^2. All are 1
-        for an infinite radius.
-    weighting: "cosine" (the ambient-occlusion integral), "uniform" (share of the hemisphere's solid angle) or, where the
-        occluder is a half-space, "volumetric" (free share of the half-ball of radius R; falloff must be "binary").
+    falloff: the attenuation W(t), t = distance / R, of an occluder: "binary" 1, "linear" 1 - t, "quadratic" 1 - t^2.
+        All are 1 for an infinite radius.
+    weighting: "cosine" (the ambient-occlusion integral), "uniform" (share of the hemisphere's solid angle) or, where
+        the occluder is a half-space, "volumetric" (free share of the half-ball of radius R; falloff must be "binary").
 They raise ChoiceError for unknown names and combinations, RangeError for numbers out of range.
 
-Occlusion is 1 - visibility; for cosine weights it is the configuration factor from the point to the occluder, the area of
-the occluder's projection onto the unit disk over pi (Nusselt analog). A falloff is a mixture of binary radii:
-occlusion_W(R) = integral over t in [0, 1] of occlusion_binary(t R) (-W'(t)). A point at distance rho lies in an occluding half-space
-if and only if its ray has hit the boundary within rho, so volumetric obscurance is uniform weighting with W(t) = 1 - t^3.
+Occlusion is 1 - visibility; for cosine weights it is the configuration factor from the point to the occluder, the area
+of the occluder's projection onto the unit disk over pi (Nusselt analog). A falloff is a mixture of binary radii:
+occlusion_W(R) = integral over t in [0, 1] of occlusion_binary(t R) (-W'(t)). A point at distance rho lies in an
+occluding half-space if and only if its ray has hit the boundary within rho, so volumetric obscurance is uniform
+weighting with W(t) = 1 - t^3.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ WEIGHTINGS = ("cosine", "uniform", "volumetric")
 
 _EXPONENT = {"linear": 1, "quadratic": 2}
 _TINY = 1e-300  # keeps 1/s and log(s) finite where s = 0 multiplies them away
-# 48 nodes leave less than 1e-11 against every closed form that exists beside the quadrature (tests/scenes).
+# 48 nodes leave less than 1e-13 against every closed form that exists beside the quadrature (tests/scenes).
 _NODES, _NODE_WEIGHTS = (0.5 * a for a in np.polynomial.legendre.leggauss(48))
 
 
@@ -49,7 +50,7 @@ def wall(distance: ArrayLike, *, radius: float = math.inf, falloff: str = "binar
     """Visibility on a floor at `distance` from an infinite perpendicular wall.
 
     With s = distance / R, occlusion is, for cosine weights and binary, linear, quadratic falloff,
-        (acos s - s sqrt(1 - s^2)) / pi,  (acos s - 2 s acosh(1/s) + s sqrt(1 - s^2)) / pi,  ((1 + 2 s^2) acos s - 3 s sqrt(1 - s^2)) / pi;
+    S(s) / pi with S = acos s - s q, acos s - 2 s acosh(1/s) + s q, (1 + 2 s^2) acos s - 3 s q and q = sqrt(1 - s^2);
     for uniform weights (1 - s) / 2, (1 - s + s ln s) / 2, (1 - s)^2 / 2; volumetric (1 - s)^2 (2 + s) / 4.
 
     Args:
@@ -95,8 +96,8 @@ def half_space(
 ) -> Array:
     """Visibility of a point at `distance` from an infinite plane of any orientation that fills the space behind it.
 
-    The rays that reach the plane within R form a spherical cap of half-angle acos(distance / R) about the direction to the
-    plane's nearest point; see `spherical_cap`. Falloffs other than binary by quadrature (error below 1e-11).
+    The rays that reach the plane within R form a spherical cap of half-angle acos(distance / R) about the direction to
+    the plane's nearest point; see `spherical_cap`. Falloffs other than binary by quadrature (error below 1e-13).
 
     Args:
         distance: >= 0, perpendicular distance to the plane, scene units.
@@ -152,7 +153,7 @@ def finite_wall(
     falloff: str = "binary",
     weighting: str = "cosine",
 ) -> Array:
-    """Visibility on a floor at `distance` from an infinitely long thin wall of finite height: `raised_slat` without a gap.
+    """Visibility on a floor at `distance` from an infinitely long thin wall: `raised_slat` without a gap.
 
     Infinite radius: 1 - (1 - x / sqrt(x^2 + H^2)) / 2; uniform 1 - atan(H / x) / pi.
 
@@ -174,13 +175,14 @@ def raised_slat(
 ) -> Array:
     """Visibility on a floor at `distance` from an infinitely long thin wall that begins at `gap` and is `height` high.
 
-    With d1, d2 the distances to the lower and the upper edge, occlusion is (x / pi) (S(d1 / R) / d1 - S(d2 / R) / d2), S the
-    numerators of `wall`; infinite radius: (x / d1 - x / d2) / 2. Uniform, binary: (P((gap + height) / d2) - P(gap / d1)) / pi with
-    P(w) = asin(w / q) - s atan(s w / sqrt(q^2 - w^2)), s = x / R, q^2 = 1 - s^2, w at most q; other uniform falloffs by quadrature.
+    With d1, d2 the distances to the lower and the upper edge, occlusion is (x / pi) (S(d1 / R) / d1 - S(d2 / R) / d2),
+    S as in `wall`; infinite radius: (x / d1 - x / d2) / 2. Uniform, binary: (P((gap + height) / d2) - P(gap / d1)) / pi
+    with P(w) = asin(w / q) - s atan(s w / sqrt(q^2 - w^2)), s = x / R, q^2 = 1 - s^2, w at most q; other uniform
+    falloffs by quadrature.
 
     Args:
         distance: >= 0; gap: >= 0; height: > 0; scene units.
-    Source: Nusselt analog (an edge parallel to the floor projects onto an ellipse of semi-axes x / d and 1); uniform derived.
+    Source: Nusselt analog (an edge parallel to the floor projects onto an ellipse of semi-axes x / d and 1).
     """
     kernel, exponent = check_question(radius, falloff, weighting, volumetric=False)
     checks.check_positive("height", float(np.min(np.asarray(height, np.float64))))
@@ -211,9 +213,9 @@ def sphere(
 ) -> Array:
     """Visibility of a point outside a sphere that may be cut by the point's horizon.
 
-    The rays that hit form a cap (`spherical_cap`) of sine r / d, or of cosine (d^2 + R^2 - r^2) / (2 d R) where R is shorter than the
-    tangent. Above the horizon and for an infinite radius occlusion is cos_angle (r / d)^2, uniform 1 - sqrt(1 - (r / d)^2).
-    Falloffs other than binary by quadrature.
+    The rays that hit form a cap (`spherical_cap`) of sine r / d, or of cosine (d^2 + R^2 - r^2) / (2 d R) where R is
+    shorter than the tangent. Above the horizon and for an infinite radius occlusion is cos_angle (r / d)^2, uniform
+    1 - sqrt(1 - (r / d)^2). Falloffs other than binary by quadrature.
 
     Args:
         distance: d > sphere_radius, to the sphere's centre, scene units.
@@ -252,8 +254,7 @@ def sphere_on_plane(
 ) -> Array:
     """Visibility on a floor at `lateral` from the contact point of a sphere that rests on it.
 
-    Infinite radius: 1 - (1 + (x / r)^2)^(-3/2); uniform x / sqrt(x^2 + r^2). Finite: as `sphere`, always above the horizon;
-    falloffs other than binary by quadrature.
+    Infinite radius: 1 - (1 + (x / r)^2)^(-3/2); uniform x / sqrt(x^2 + r^2). Finite: as `sphere`, above the horizon.
 
     Args:
         lateral: x >= 0; sphere_radius: r > 0; scene units.
@@ -274,9 +275,9 @@ def sphere_on_plane(
 def spherical_cap(cos_half_angle: ArrayLike, cos_tilt: ArrayLike, *, weighting: str = "cosine") -> Array:
     """Visibility when all directions within a cone are blocked and no others.
 
-    With c = cos_half_angle, q = sqrt(1 - c^2), t = cos_tilt, u = sqrt(1 - t^2): occlusion is t q^2 for t >= q (above the horizon), 0 for
-    t <= -q (below), else (t q^2 acos(-t c / (q u)) - c sqrt(q^2 - t^2) + atan2(sqrt(q^2 - t^2), c)) / pi.
-    Uniform: 1 - c, 0, 1 - (acos(t / q) + c acos(-t c / (q u))) / pi.
+    With c = cos_half_angle, q = sqrt(1 - c^2), t = cos_tilt, u = sqrt(1 - t^2): occlusion is t q^2 for t >= q (above
+    the horizon), 0 for t <= -q (below), else (t q^2 acos(-t c / (q u)) - c sqrt(q^2 - t^2) + atan2(sqrt(q^2 - t^2), c))
+    / pi. Uniform: 1 - c, 0, 1 - (acos(t / q) + c acos(-t c / (q u))) / pi.
 
     Args:
         cos_half_angle: in [0, 1], cosine of the cone's half-angle.
@@ -331,7 +332,7 @@ def _ramp(s: Array, exponent: int | None) -> Array:
 
 
 def _strip(x: Array, height: Array, reach: ArrayLike) -> Array:
-    """Integral of sqrt(1 - s^2 / cos^2), s = x / reach, over elevations from 0 to that of an edge, as far as it is real."""
+    """Integral of sqrt(1 - (x / reach / cos)^2) over elevations from 0 to that of an edge, as far as it is real."""
     s = np.minimum(x / np.maximum(reach, _TINY), 1.0)
     edge = np.maximum(np.hypot(x, height), _TINY)
     short = np.minimum(edge / np.maximum(reach, _TINY), 1.0)
@@ -354,7 +355,7 @@ def _cap(cos_half: Array, tilt: Array, kernel: str) -> Array:
 
 
 def _cap_of_sphere(d: Array, tangent: Array, reach: ArrayLike) -> Array:
-    """Cosine of the cone of rays of length `reach` that hit a sphere whose centre is d and whose tangents are `tangent` away."""
+    """Cosine of the cone of rays of length `reach` that hit a sphere; centre `d`, tangent points `tangent` away."""
     reach = np.minimum(reach, tangent)  # beyond its tangent points a sphere only hides itself
     return np.minimum((tangent**2 + reach**2) / (2.0 * d * np.maximum(reach, _TINY)), 1.0)
 
@@ -362,7 +363,7 @@ def _cap_of_sphere(d: Array, tangent: Array, reach: ArrayLike) -> Array:
 def _attenuated(
     binary: Callable[[ArrayLike], Array], radius: float, exponent: int | None, breaks: tuple[Array, ...]
 ) -> Array:
-    """Integral over t in [0, 1] of binary(t R) p t^(p - 1); `binary` is 0 before the first break and smooth between them."""
+    """Integral over t in [0, 1] of binary(t R) p t^(p - 1); `binary` is 0 before the first break, smooth between."""
     if exponent is None or math.isinf(radius):
         return binary(radius)
     edges = np.sort(
