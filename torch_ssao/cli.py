@@ -142,6 +142,7 @@ def _measure_options(arguments: argparse.Namespace) -> dict[str, Any]:
         "technique": arguments.technique,
         "radius": arguments.radius,
         "parameters": arguments.parameters,
+        "max_evaluations": arguments.max_evaluations,
         "progress": _progress(arguments),
     }
 
@@ -309,6 +310,8 @@ def _add_measure(commands: Any, name: str, function: Any, text: str) -> None:
     parser.add_argument("--fit-views", type=_numbers, default=(0,), metavar="0", help="views to fit on (default 0)")
     parser.add_argument("--views", type=_numbers, metavar="1,2", help="views to judge on; all others if left out")
     parser.add_argument("--parameters", type=_names, metavar="radius,height", help="parameters to fit; all if left out")
+    budget = "budget of each fit, in forward passes; by the number of parameters if left out"
+    parser.add_argument("--max-evaluations", type=int, metavar="N", help=budget)
 
 
 def _add_common(parser: argparse.ArgumentParser, size: tuple[int, int]) -> None:

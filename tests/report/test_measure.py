@@ -102,6 +102,7 @@ def test_chosen_views_radius_and_parameters(tmp_path: Path) -> None:
         ({"views": [7]}, checks.RangeError, "views must be indices below 2"),
         ({"fit_views": (9,)}, checks.RangeError, "views must be indices below 2"),
         ({"parameters": ("size",)}, checks.ChoiceError, "parameters must be one of 'radius'"),
+        ({"max_evaluations": 3}, checks.RangeError, "max_evaluations must be a whole number at least 10"),
         ({"height": 10}, checks.RangeError, "height must be a whole number at least 11"),
         ({"radius": 0.0}, checks.RangeError, "radius must be finite and greater than 0"),
         ({"repeats": 3}, checks.RangeError, "repeats must be a whole number at least 5"),

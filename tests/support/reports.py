@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -39,7 +40,7 @@ def fake_fit(module: AmbientVisibility, gbuffer: GBuffer, target: Any, *, valid:
     return SimpleNamespace(
         module=best,
         values=best.values(),
-        standard_errors={name: 0.01 for name in names if name != "falloff"},
+        standard_errors={name: math.inf if name == "falloff" else 0.01 for name in names},
         undetermined=("falloff",) if "falloff" in names else (),
         rmse=error,
         initial_rmse=candidates[0][0],

@@ -23,7 +23,7 @@ WORTH = 1e-3
 FIRST_DAMPING = 1e-2  # of the largest diagonal entry of J'J, Marquardt's tau
 APART = 0.7  # distance in logarithms below which two scan points lead to the same place
 POLISH_ROUNDS = 6  # rounds of evaluations kept back for the polish
-STARTS = 8
+STARTS = 12
 SAME = 5e-3, 0.05  # relative distance in RMSE and distance in logarithms below which two descents found the same minimum
 RUNAWAY = math.log(16.0)  # a descent that moves a parameter by more from the start follows a ridge to infinity
 

@@ -111,6 +111,9 @@ def load(path: str | Path) -> Reference:
     """
     source = Path(path)
     try:
+        with zipfile.ZipFile(source) as archive:
+            if archive.testzip() is not None:  # numpy does not read far enough to reach the checksums
+                raise zipfile.BadZipFile("checksum")
         with np.load(source, allow_pickle=False) as file:
             facts = json.loads(str(file["facts"]))
             if facts.pop("format") != _FORMAT:

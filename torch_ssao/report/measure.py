@@ -112,6 +112,7 @@ def measure(
     technique: str = "statvo",
     radius: float | None = None,
     parameters: tuple[str, ...] | None = None,
+    max_evaluations: int | None = None,
     repeats: int = row_tools.REPEATS,
     seed: int = 0,
     progress: bool | None = None,
@@ -131,6 +132,7 @@ def measure(
         technique: a name in `modules.TECHNIQUES`.
         radius: scene units, of the reference and of the untuned modules; None for the scene's suggestion.
         parameters: names to fit; None for all that the technique uses.
+        max_evaluations: budget of each fit; None for that of `fitting.fit`.
         repeats: timed forward passes per module, at least 5.
         seed: of the reference's sampling pattern.
         progress: bars and notes on stderr; None shows them on a terminal only.
@@ -144,9 +146,9 @@ def measure(
     settings = TraceSettings(height, width, scene.radius if radius is None else radius, samples, seed)
     modules = row_tools.candidates(technique, settings.radius, layers)
     fit_on, judged = _split_views(scene, views, fit_views)
-    _check_arguments(settings, repeats, modules[0][2], parameters)
+    _check_arguments(settings, repeats, modules[0][2], parameters, max_evaluations)
     folder = checks.check_output_folder("out", out)
-    return _run(_Plan(scene, folder, settings, modules, fit_on, judged, parameters, repeats, progress))
+    return _run(_Plan(scene, folder, settings, modules, fit_on, judged, parameters, max_evaluations, repeats, progress))
 
 
 def write_json(measurement: Measurement, *more_files: str) -> Measurement:
@@ -175,6 +177,7 @@ class _Plan:
     fit_on: list[int]
     judged: list[int]
     parameters: tuple[str, ...] | None
+    max_evaluations: int | None
     repeats: int
     progress: bool | None
 
@@ -249,7 +252,13 @@ def _fit_all(plan: _Plan, data: _Data) -> tuple[list[_Fit], tuple[str, ...]]:
     for name, label, module in plan.modules:
         plan.note(f"fitting {label}")
         result = fitting.fit(
-            module, gbuffer, truth, parameters=plan.parameters, valid=truth.valid, progress=plan.progress
+            module,
+            gbuffer,
+            truth,
+            parameters=plan.parameters,
+            valid=truth.valid,
+            max_evaluations=plan.max_evaluations,
+            progress=plan.progress,
         )
         serialize.save(result.module, plan.folder / f"{name}.json")
         fitted.append((name, label, result.module, _summarise(result)))
@@ -277,12 +286,19 @@ def _split_views(scene: Scene, views: Iterable[int] | None, fit_views: Iterable[
 
 
 def _check_arguments(
-    settings: TraceSettings, repeats: int, module: AmbientVisibility, parameters: tuple[str, ...] | None
+    settings: TraceSettings,
+    repeats: int,
+    module: AmbientVisibility,
+    parameters: tuple[str, ...] | None,
+    max_evaluations: int | None,
 ) -> None:
     checks.check_count("height", settings.height, SMALLEST)
     checks.check_count("width", settings.width, SMALLEST)
     checks.check_count("samples", settings.samples, 2)
     checks.check_count("repeats", repeats, 5)
+    if max_evaluations is not None:  # two residuals with their Jacobians, the least a fit can work with
+        fitted = module.used_parameters() if parameters is None else parameters
+        checks.check_count("max_evaluations", max_evaluations, 2 * (len(fitted) + 1))
     for name in parameters or ():
         checks.check_choice("parameters", name, module.used_parameters())
 
