@@ -59,7 +59,11 @@ def compare(name: str, layers: int, options: argparse.Namespace) -> dict[str, An
     row = {"scene": name, "layers": layers, "grid": grid | {"held_out": judge(tuned)}}
     for label, parameters in (("two", ("radius", "contrast")), ("all", None)):
         fit = ts.fitting.fit(
-            ts.StatVO(scene.radius, layers=layers), gbuffer[0], truth.visibility[:1], parameters=parameters, progress=False
+            ts.StatVO(scene.radius, layers=layers),
+            gbuffer[0],
+            truth.visibility[:1],
+            parameters=parameters,
+            progress=False,
         )
         row[label] = {
             "rmse": fit.rmse,
@@ -79,7 +83,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/bench/fit_against_grid.json"))
     options = parser.parse_args()
     rows = []
-    print("scene  layers | RMSE grid (600)  two (evaluations)  difference | held-out grid  two  all (evaluations)", flush=True)
+    print(
+        "scene  layers | RMSE grid (600)  two (evaluations)  difference | held-out grid  two  all (evaluations)",
+        flush=True,
+    )
     for name in ts.scenes.names():
         for layers in options.layers:
             r = compare(name, layers, options)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from support.clutter import clutter
 
 import torch_ssao as ts
+from support.clutter import clutter
 from torch_ssao.fitting.parameters import ParameterSpace
 from torch_ssao.fitting.residuals import BudgetSpent, Residuals
 from torch_ssao.fitting.scan import scan_points

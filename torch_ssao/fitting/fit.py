@@ -63,9 +63,10 @@ def fit(
     Cost: `evaluations` forward passes of all views (a Jacobian column costs about one and a half); memory one view at a time.
     Source: Marquardt 1963; the scan is a Sobol sequence over factors of 1/8 to 8.
     """
-    began = time.perf_counter()
     if not isinstance(module, AmbientVisibility):
-        raise checks.ChoiceError(f"module must be a technique of torch_ssao, got {type(module).__name__}: pass e.g. StatVO()")
+        raise checks.ChoiceError(
+            f"module must be a technique of torch_ssao, got {type(module).__name__}: pass e.g. StatVO()"
+        )
     names = choose_parameters(module, parameters)
     image = getattr(target, "visibility", target)
     weight = _pixel_weights(gbuffer, image, weights, valid)
@@ -73,27 +74,55 @@ def fit(
     budget = BUDGET.get(len(names), BUDGET_MANY) if max_evaluations is None else max_evaluations
     checks.check_count("max_evaluations", budget, 2 * (len(names) + 1))
     bridge.check_installed()
+    began = time.perf_counter()
     with _Bar(budget, progress) as bar:
-        residuals = Residuals(module, gbuffer, image.to(gbuffer.depth.device), weight, names, budget, bar.update)
+        residuals = Residuals(module, gbuffer, image.to(weight.device), weight, names, budget, bar.update)
         initial = float(residuals.value(space.start).norm())
         outcome = search(residuals, space, with_scan=scan)
-    if residuals.best_log is None or residuals.best is None or not math.isfinite(initial):
-        raise checks.RangeError("module gives NaN at its starting values: check its parameters and the G-buffer")
-    best_log, best = residuals.best_log, residuals.best
+    noise = getattr(target, "standard_error", None)
+    return _conclude(module, space, residuals, outcome, initial, weight, noise, time.perf_counter() - began)
+
+
+def _conclude(
+    module: AmbientVisibility,
+    space: ParameterSpace,
+    residuals: Residuals,
+    outcome: Outcome,
+    initial: float,
+    weight: Tensor,
+    noise: Tensor | None,
+    seconds: float,
+) -> FitResult:
+    """The result at the best point seen."""
+    log, best = residuals.best_log, residuals.best
+    if log is None or best is None:
+        raise checks.RangeError("module gives NaN at every point tried: check its parameters and the G-buffer")
     fitted = copy.deepcopy(module)
-    if residuals.rmse < initial:
-        for name, log in zip(names, best_log.tolist(), strict=True):
-            setattr(fitted, name, math.exp(log))
-    jacobian = residuals.jacobian(best_log, counted=False)
-    flat = uncertainty.undetermined(jacobian, space, best_log)
-    noise = _noise(target, weight, residuals, best)
-    spread = uncertainty.covariance(jacobian, noise).diagonal().clamp(min=0).sqrt().tolist()
+    if not torch.equal(log, space.start):
+        for name, value in zip(space.names, log.exp().tolist(), strict=True):
+            setattr(fitted, name, value)
+    jacobian = residuals.jacobian(log, counted=False)
+    # Without a stated noise of the target, the size of each residual stands in for it.
+    spread = best.abs() if noise is None else residuals.gather(weight.sqrt() * noise.to(weight.device).double())
+    deviations = uncertainty.covariance(jacobian, spread).diagonal().clamp(min=0).sqrt().tolist()
+    flat = uncertainty.undetermined(jacobian, space, log)
     values = fitted.values()
-    errors = {n: math.inf if n in flat else values[n] * s for n, s in zip(names, spread, strict=True)}
     return FitResult(
-        fitted, values, errors, flat, residuals.rmse, initial, outcome.steps, outcome.starts, residuals.evaluations,
-        _message(residuals, outcome, initial), time.perf_counter() - began,
-    )  # fmt: skip
+        module=fitted,
+        values=values,
+        standard_errors={
+            name: math.inf if name in flat else values[name] * deviation
+            for name, deviation in zip(space.names, deviations, strict=True)
+        },
+        undetermined=flat,
+        rmse=residuals.rmse,
+        initial_rmse=initial,
+        steps=outcome.steps,
+        starts=outcome.starts,
+        evaluations=residuals.evaluations,
+        message=_message(residuals, outcome, initial),
+        seconds=seconds,
+    )
 
 
 def _pixel_weights(gbuffer: GBuffer, image: Any, weights: Tensor | None, valid: Tensor | None) -> Tensor:
@@ -116,14 +145,10 @@ def _pixel_weights(gbuffer: GBuffer, image: Any, weights: Tensor | None, valid: 
         raise checks.RangeError("gbuffer, valid and weights leave no pixel to fit: choose views that see something")
     bad = int((~torch.isfinite(image.to(weight.device)) & (weight > 0)).sum())
     if bad:
-        raise checks.RangeError(f"target must be finite where it counts, got {bad} pixels that are not: mask them with valid")
+        raise checks.RangeError(
+            f"target must be finite where it counts, got {bad} pixels that are not: mask them with valid"
+        )
     return weight / weight.sum()
-
-
-def _noise(target: Any, weight: Tensor, residuals: Residuals, best: Tensor) -> Tensor:
-    """(N,) standard deviation of each weighted residual."""
-    stated = getattr(target, "standard_error", None)
-    return best.abs() if stated is None else residuals.gather(weight.sqrt() * stated.to(weight.device).double())
 
 
 def _message(residuals: Residuals, outcome: Outcome, initial: float) -> str:

@@ -28,7 +28,9 @@ def choose_parameters(module: AmbientVisibility, parameters: str | tuple[str, ..
         return module.learnable or used
     names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
     if not names:
-        raise checks.ChoiceError(f"parameters must name at least one of {', '.join(used)}, got none: pass None for the module's own list")
+        raise checks.ChoiceError(
+            f"parameters must name at least one of {', '.join(used)}, got none: pass None for the module's own list"
+        )
     for name in names:
         checks.check_choice("parameters", name, used)
     return tuple(name for name in used if name in names)

@@ -24,7 +24,10 @@ FIRST_DAMPING = 1e-2  # of the largest diagonal entry of J'J, Marquardt's tau
 APART = 0.7  # distance in logarithms below which two scan points lead to the same place
 POLISH_ROUNDS = 6  # rounds of evaluations kept back for the polish
 STARTS = 12
-SAME = 5e-3, 0.05  # relative distance in RMSE and distance in logarithms below which two descents found the same minimum
+SAME = (
+    5e-3,
+    0.05,
+)  # relative distance in RMSE and distance in logarithms below which two descents found the same minimum
 RUNAWAY = math.log(16.0)  # a descent that moves a parameter by more from the start follows a ridge to infinity
 
 
@@ -114,5 +117,7 @@ class _Descent:
         stacked = torch.cat((jacobian, residual[:, None]), 1)
         stacked = torch.nn.functional.pad(stacked, (0, 0, 0, max(0, stacked.shape[1] - len(stacked))))
         upper = torch.linalg.qr(stacked, mode="r").R
-        upper = upper * torch.where(upper.diagonal() < 0, -1.0, 1.0)[:, None]  # unique, hence comparable from step to step
+        upper = (
+            upper * torch.where(upper.diagonal() < 0, -1.0, 1.0)[:, None]
+        )  # unique, hence comparable from step to step
         return (self.scale * upper).cpu().numpy()
