@@ -95,7 +95,8 @@ def main() -> None:
             print(
                 f"{name:8} {layers} | {g['rmse']:.5f} {t['rmse']:.5f} ({t['evaluations']}) {t['rmse'] - g['rmse']:+.5f} | "
                 f"{g['held_out']:.5f} {t['held_out']:.5f} {a['held_out']:.5f} ({a['evaluations']}) "
-                f"{'worse' if a['held_out'] > g['held_out'] else 'better'} | {g['seconds']:.1f} {t['seconds']:.1f} {a['seconds']:.1f} s",
+                f"{'worse' if a['held_out'] > g['held_out'] else 'better'} | "
+                f"{g['seconds']:.1f} {t['seconds']:.1f} {a['seconds']:.1f} s",
                 flush=True,
             )
     options.out.parent.mkdir(parents=True, exist_ok=True)

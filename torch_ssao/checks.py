@@ -35,6 +35,10 @@ class SceneError(ValueError):
     """A mesh, a camera file or a view cannot be used."""
 
 
+class MissingExtraError(ValueError):
+    """A library of an optional extra is not installed."""
+
+
 class OutputError(ValueError):
     """A result cannot be written where it was asked for."""
 

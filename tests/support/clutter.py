@@ -41,7 +41,9 @@ def _place_boxes(generator: torch.Generator, walls: bool, count: int = 8) -> Pai
     ranges = ((-2.5, 1.5), (0, 0), (-2.5, 1.5))
     low = torch.stack([_uniform(generator, count, *span) for span in ranges], -1)
     size = torch.stack([_uniform(generator, count, *span) for span in ((0.3, 1.2), (0.2, 1.5), (0.3, 1.2))], -1)
-    fixed = torch.tensor([[[-3, -0.1, -3], [3, 0, 3]], [[-3.1, 0, -3], [-3, 3, 3]], [[-3, 0, -3.1], [3, 3, -3]]]).double()
+    fixed = torch.tensor(
+        [[[-3, -0.1, -3], [3, 0, 3]], [[-3.1, 0, -3], [-3, 3, 3]], [[-3, 0, -3.1], [3, 3, -3]]]
+    ).double()
     kept = fixed if walls else fixed[:1]
     return torch.cat((low, kept[:, 0])), torch.cat((low + size, kept[:, 1]))
 
@@ -53,7 +55,9 @@ def _place_spheres(generator: torch.Generator, count: int = 5) -> Pair:
 
 def _cast(camera: Camera, pose: Tensor, eye: Tensor, boxes: Pair, spheres: Pair) -> GBuffer:
     x, y = torch.broadcast_tensors(*camera.rays(dtype=torch.float64))
-    ray = torch.stack((x, y, torch.ones_like(x)), -1)[0] @ pose[:3, :3]  # one unit of view depth a unit of t: t is the depth
+    ray = (
+        torch.stack((x, y, torch.ones_like(x)), -1)[0] @ pose[:3, :3]
+    )  # one unit of view depth a unit of t: t is the depth
     one, other = ((bound - eye) / ray[..., None, :] for bound in boxes)  # (H, W, N, 3)
     near, axis = torch.minimum(one, other).max(-1)
     far = torch.maximum(one, other).amin(-1)

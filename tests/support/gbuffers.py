@@ -56,10 +56,8 @@ def plane_gbuffer(
     dtype: torch.dtype = torch.float32,
 ) -> ts.GBuffer:
     """An infinite plane seen at an angle from its normal, with its exact depth and normal."""
-    if orthographic:
-        camera = ts.Camera.orthographic(2.0, height, width)
-    else:
-        camera = ts.Camera.perspective(fov_y_deg, height, width)
+    size = (height, width)
+    camera = ts.Camera.orthographic(2.0, *size) if orthographic else ts.Camera.perspective(fov_y_deg, *size)
     angle = torch.deg2rad(torch.tensor(view_angle_deg, dtype=torch.float64))
     normal = torch.stack((torch.zeros_like(angle), -torch.sin(angle), -torch.cos(angle)))
     x, y = camera.to(torch.float64).rays()

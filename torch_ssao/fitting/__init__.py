@@ -1,5 +1,4 @@
 """Fit techniques to references: parameters to R^n, forward-mode Jacobians, optimistix, standard errors."""
 
-from torch_ssao.fitting.bridge import MissingExtraError as MissingExtraError
 from torch_ssao.fitting.fit import fit as fit
 from torch_ssao.fitting.result import FitResult as FitResult

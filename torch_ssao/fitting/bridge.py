@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_ssao.checks import MissingExtraError
+
 Array = NDArray[np.float64]
 Evaluate = Callable[[Array], tuple[Array, Array]]
 
@@ -25,10 +27,6 @@ TOLERANCE = 1e-6  # in u and in the scaled residuals: far below what a fit can t
 
 _LOCK = threading.Lock()  # jax's float64 flag is global, and so is the evaluation that the compiled solver visits
 _ACTIVE: list[_Visit] = []
-
-
-class MissingExtraError(ValueError):
-    """A library of an optional extra is not installed."""
 
 
 class StopSolver(Exception):

@@ -61,13 +61,16 @@ class ParameterSpace:
 
         Raises: RangeError when a starting value lies outside its bounds.
         """
-        start, low, high = [], [], []
+        start: list[float] = []
+        low: list[float] = []
+        high: list[float] = []
         for name in names:
             spec, value = module.PARAMETERS[name], float(getattr(module, name).detach())
             unit = value if spec.relative_bounds else 1.0
             if not (math.isfinite(value) and spec.low * unit < value < spec.high * unit):
                 raise checks.RangeError(
-                    f"module.{name} must start between {spec.low:g} and {spec.high:g}, got {value:g}: set module.{name} to 1 or so first"
+                    f"module.{name} must start between {spec.low:g} and {spec.high:g}, got {value:g}: "
+                    f"set module.{name} to 1 or so first"
                 )
             for listed, number in ((start, value), (low, spec.low * unit), (high, spec.high * unit)):
                 listed.append(math.log(number))
@@ -82,7 +85,8 @@ class ParameterSpace:
 
     def to_log(self, u: Tensor) -> Tensor:
         """(..., P) logarithms of the parameters at u."""
-        return self.low + self._width * torch.sigmoid(4 * u / self._width)
+        inside = self.low + self._width * torch.sigmoid(4 * u / self._width)
+        return inside.clamp(self.low, self.high)  # rounding must not leave the bounds
 
     def from_log(self, log: Tensor) -> Tensor:
         """(..., P) points u of logarithms; those outside are first brought just inside the bounds."""

@@ -103,8 +103,8 @@ class Residuals:
         """(P, H, W) tangents of the visibility."""
 
         def column(direction: Tensor) -> Tensor:
-            _, tangent = torch.func.jvp(lambda at: self._predict(gbuffer, at), (log,), (direction,))
-            return tangent  # type: ignore[no-any-return]
+            pushed = torch.func.jvp(lambda at: self._predict(gbuffer, at), (log,), (direction,))
+            return pushed[1]  # type: ignore[no-any-return]
 
         return torch.func.vmap(column)(torch.eye(len(self.names), dtype=log.dtype))
 
