@@ -109,14 +109,19 @@ def test_stated_error_matches_a_long_run_and_beats_plain_monte_carlo(scene: Scen
 @pytest.mark.parametrize("name", scenes.names())
 @pytest.mark.parametrize("falloff", reference.FALLOFFS)
 def test_noise_of_every_builtin_scene(name: str, falloff: str) -> None:
-    size = {"height": 60, "width": 80, "falloff": falloff}
+    size = {"height": 48, "width": 64, "views": 1, "falloff": falloff}
     scene = scenes.builtin(name)
     truth = reference.raytrace(scene, **size, samples=16384, seed=7)
     for samples in (32, 512):
-        found = compare(truth.visibility, reference.raytrace(scene, **size, samples=samples, seed=1))
-        assert abs(found.stated_error / found.rms_error - 1) < 0.1
-        assert found.share_within_3 >= 0.95
-    assert found.rms_error < 0.4 * found.monte_carlo_error
+        found = [
+            compare(truth.visibility, reference.raytrace(scene, **size, samples=samples, seed=seed))
+            for seed in range(1, 5)
+        ]
+        # A few pixels carry most of the noise: four seeds together tell a wrong scale from chance.
+        stated, measured = (sum(getattr(f, name) ** 2 for f in found) for name in ("stated_error", "rms_error"))
+        assert abs((stated / measured) ** 0.5 - 1) < 0.1
+        assert min(f.share_within_3 for f in found) >= 0.95
+    assert measured < 0.4**2 * sum(f.monte_carlo_error**2 for f in found)
 
 
 def test_falloffs_are_ordered_and_radius_darkens(scene: Scene) -> None:

@@ -55,9 +55,7 @@ def _place_spheres(generator: torch.Generator, count: int = 5) -> Pair:
 
 def _cast(camera: Camera, pose: Tensor, eye: Tensor, boxes: Pair, spheres: Pair) -> GBuffer:
     x, y = torch.broadcast_tensors(*camera.rays(dtype=torch.float64))
-    ray = (
-        torch.stack((x, y, torch.ones_like(x)), -1)[0] @ pose[:3, :3]
-    )  # one unit of view depth a unit of t: t is the depth
+    ray = torch.stack((x, y, torch.ones_like(x)), -1)[0] @ pose[:3, :3]  # t is the view depth
     one, other = ((bound - eye) / ray[..., None, :] for bound in boxes)  # (H, W, N, 3)
     near, axis = torch.minimum(one, other).max(-1)
     far = torch.maximum(one, other).amin(-1)

@@ -43,8 +43,10 @@ def speed_error_png(measurement: Measurement) -> bytes:
             zorder=3,
         )
         for row, x, y in zip(rows, middle, error, strict=True):
-            # Untuned labels above and fitted ones below: the two curves rarely cross.
-            shift = (0, -16) if fitted else (0, 9)
+            # The worse of a pair is labelled above and the better below, clear of each other.
+            others = [o.validation.rmse for o in measurement.rows if o.name == row.name and o is not row]
+            above = y > max(others) if others and y != others[0] else not fitted
+            shift = (0, 9) if above else (0, -16)
             style: dict[str, Any] = {"ha": "center", "fontsize": 8, "color": colour}
             axes.annotate(row.label, (x, y), xytext=shift, textcoords="offset points", **style)
     constant, ceiling = measurement.constant.validation.rmse, measurement.ceiling.rmse
