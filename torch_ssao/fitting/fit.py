@@ -22,7 +22,7 @@ from torch_ssao.gbuffer import GBuffer
 from torch_ssao.modules import AmbientVisibility
 
 BUDGET = {1: 60, 2: 100, 3: 180}  # evaluations by number of parameters: scan, descents and polish
-BUDGET_MANY = 260
+BUDGET_MANY = 400
 
 
 def fit(
@@ -52,7 +52,7 @@ def fit(
         parameters: names to fit; None for the module's `learnable` ones or, when it has none, all that it uses.
         weights: (B, 1, H, W) >= 0, importance of each pixel; None for all alike.
         valid: (B, 1, H, W) bool, further pixels to leave out; invalid pixels of the G-buffer never count.
-        max_evaluations: budget, every residual, Jacobian column and scan point counted as one; None for 60, 100, 180 or 260 by
+        max_evaluations: budget, every residual, Jacobian column and scan point counted as one; None for 60, 100, 180 or 400 by
             the number of parameters (1, 2, 3, more).
         scan: False starts from the module's own values only.
         progress: show a bar on stderr; None for only when that is a terminal.
@@ -76,7 +76,8 @@ def fit(
     bridge.check_installed()
     began = time.perf_counter()
     with _Bar(budget, progress) as bar:
-        residuals = Residuals(module, gbuffer, image.to(weight.device), weight, names, budget, bar.update)
+        searching = budget - len(names)  # the last Jacobian, for the standard errors, is paid for too
+        residuals = Residuals(module, gbuffer, image.to(weight.device), weight, names, searching, bar.update)
         initial = float(residuals.value(space.start).norm())
         outcome = search(residuals, space, with_scan=scan)
     noise = getattr(target, "standard_error", None)
@@ -101,7 +102,8 @@ def _conclude(
     if not torch.equal(log, space.start):
         for name, value in zip(space.names, log.exp().tolist(), strict=True):
             setattr(fitted, name, value)
-    jacobian = residuals.jacobian(log, counted=False)
+    residuals.budget += len(space)  # kept back from the search for this Jacobian
+    jacobian = residuals.jacobian(log)
     # Without a stated noise of the target, the size of each residual stands in for it.
     spread = best.abs() if noise is None else residuals.gather(weight.sqrt() * noise.to(weight.device).double())
     deviations = uncertainty.covariance(jacobian, spread).diagonal().clamp(min=0).sqrt().tolist()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import final
 
@@ -10,6 +11,10 @@ from torch import Tensor
 
 from torch_ssao.gbuffer import GBuffer
 from torch_ssao.modules import AmbientVisibility
+
+
+CONTRAST_REACH = 1.5  # logarithm; a scan's neighbours never need more
+CONTRAST_ROUNDS = 6  # to 2e-4 of the contrast
 
 
 class BudgetSpent(Exception):
@@ -76,13 +81,36 @@ class Residuals:
             ]
         return self._seen(log, torch.cat(parts))
 
-    def jacobian(self, log: Tensor, *, counted: bool = True) -> Tensor:
-        """(N, P) derivatives of the residuals to the logarithms. P evaluations. Raises: BudgetSpent, unless not `counted`.
+    def value_at_best_contrast(self, log: Tensor) -> Tensor:
+        """Like `value`, but with the contrast that suits this image best; returns the (P,) logarithms with it.
+
+        Contrast is the last thing every technique does (visibility^contrast), so that trying another one costs a power and
+        no evaluation. One evaluation; without "contrast" among the names the same as `value`. Raises: BudgetSpent.
+        """
+        residual = self.value(log)
+        if "contrast" not in self.names:
+            return log
+        at = self.names.index("contrast")
+        root = torch.cat([view[3] for view in self._views])
+        wanted = torch.cat([view[2] for view in self._views])
+        image = (residual / root + wanted).clamp(0, 1)
+        low, high = -CONTRAST_REACH, CONTRAST_REACH
+        for _ in range(CONTRAST_ROUNDS):  # a narrowing grid: the error is smooth in contrast and has one minimum
+            tried = torch.linspace(low, high, 9, dtype=torch.float64).tolist()
+            errors = [float(((image ** math.exp(step) - wanted) * root).norm()) for step in tried]
+            least = min(range(9), key=errors.__getitem__)
+            low, high = tried[max(least - 1, 0)], tried[min(least + 1, 8)]
+        moved = log.clone()
+        moved[at] += 0.5 * (low + high)
+        self._seen(moved, (image ** math.exp(0.5 * (low + high)) - wanted) * root)
+        return moved
+
+    def jacobian(self, log: Tensor) -> Tensor:
+        """(N, P) derivatives of the residuals to the logarithms. P evaluations. Raises: BudgetSpent.
 
         Forward mode with the tangents as a vmapped batch: the primal is computed once for all columns, one view at a time.
         """
-        if counted:
-            self._spend(len(self.names))
+        self._spend(len(self.names))
         columns = []
         with torch.no_grad():
             for gbuffer, inside, _, root in self._views:

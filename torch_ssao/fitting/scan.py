@@ -12,7 +12,7 @@ from torch_ssao.fitting.residuals import Residuals
 
 REACH = math.log(8.0)  # a start four times off is well inside
 POINTS = {1: 8, 2: 20, 3: 28}  # evaluations by number of parameters, found on synthetic clutter
-MANY = 48
+MANY = 64
 
 
 def scan_points(space: ParameterSpace) -> Tensor:

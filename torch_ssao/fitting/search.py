@@ -22,10 +22,10 @@ PATIENCE = 3  # visits without a relative gain of WORTH after which a descent ha
 WORTH = 1e-3
 FIRST_DAMPING = 1e-2  # of the largest diagonal entry of J'J, Marquardt's tau
 APART = 0.7  # distance in logarithms below which two scan points lead to the same place
-POLISH_ROUNDS = 6  # rounds of evaluations kept back for the polish
-STARTS = 8
-VALLEY_POINTS = 24
-VALLEY_SPACING = 0.055  # in logarithms of the parameter that moves most; ripples seen on built-in scenes are 0.2 to 0.4 long
+POLISH_ROUNDS = 4  # rounds of evaluations kept back for the polish
+STARTS = 12
+WALKS = ((24, 0.05), (16, 0.006))  # points and spacing in log radius; the ripples seen are 0.02 to 0.4 long
+WALK_COST = sum(count for count, _ in WALKS)
 SAME = (
     5e-3,
     0.05,
@@ -46,7 +46,7 @@ class Outcome:
 def search(residuals: Residuals, space: ParameterSpace, *, with_scan: bool) -> Outcome:
     """Find the least |r| within the budget; the best point stays in `residuals`."""
     candidates = scan(residuals, space) if with_scan else [space.start]
-    reserve = min(POLISH_ROUNDS * (len(space) + 1) + VALLEY_POINTS + len(space), residuals.left // 2)
+    reserve = min(POLISH_ROUNDS * (len(space) + 1) + WALK_COST, 2 * residuals.left // 3)
     tried: list[Tensor] = []
     ends: list[tuple[float, Tensor]] = []
     steps = 0
@@ -60,31 +60,30 @@ def search(residuals: Residuals, space: ParameterSpace, *, with_scan: bool) -> O
         descent = _Descent(residuals, space, reserve)
         steps += descent.run(candidate)
         ends.append((descent.least, descent.at))
-    walk_valley(residuals, space)
+    walk_radius(residuals, space)
     refined, converged = polish(residuals, space)
     return Outcome(len(tried), steps + refined, converged)
 
 
-def walk_valley(residuals: Residuals, space: ParameterSpace) -> None:
-    """Evaluate points along the flattest direction of the error through the best point, outward on both sides.
+def walk_radius(residuals: Residuals, space: ParameterSpace) -> None:
+    """Evaluate radii outward from the best point on both sides, each with the contrast that suits it best; then again, closer.
 
-    Parameters trade off (a larger radius against less contrast), so the error has a long valley, and regular scenes put ripples on
-    its floor: a descent ends in the nearest. Skipped unless the budget pays for all its points.
-    Cost: P + `VALLEY_POINTS` evaluations.
+    Radius and contrast trade off, so the error has a long valley, and regular scenes (columns, windows) put ripples on its floor:
+    a descent ends in the nearest. Skipped unless the radius is fitted and the budget pays for all points.
+    Cost: the sum of `WALKS`.
     """
-    origin = residuals.best_log
-    if origin is None or residuals.left < len(space) + VALLEY_POINTS or residuals.rmse < PERFECT:
+    if "radius" not in space.names or residuals.left < WALK_COST or residuals.rmse < PERFECT:
         return
-    _, directions = torch.linalg.eigh(_gram(residuals.jacobian(origin)))
-    along = directions[:, 0] / directions[:, 0].abs().max()
-    for step in range(1, VALLEY_POINTS // 2 + 1):
+    at = space.names.index("radius")
+    for count, spacing in WALKS:
+        if residuals.best_log is None:
+            return
+        origin = residuals.best_log
         for side in (-1, 1):
-            point = origin + side * step * VALLEY_SPACING * along
-            residuals.value(torch.maximum(torch.minimum(point, space.high), space.low))
-
-
-def _gram(jacobian: Tensor) -> Tensor:
-    return (jacobian.T @ jacobian).cpu()
+            point = origin.clone()
+            for _ in range(count // 2):
+                point[at] = (point[at] + side * spacing).clamp(space.low[at], space.high[at])
+                point = residuals.value_at_best_contrast(point)
 
 
 def _found_twice(ends: list[tuple[float, Tensor]]) -> bool:
