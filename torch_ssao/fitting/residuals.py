@@ -12,7 +12,6 @@ from torch import Tensor
 from torch_ssao.gbuffer import GBuffer
 from torch_ssao.modules import AmbientVisibility
 
-
 CONTRAST_REACH = 1.5  # logarithm; a scan's neighbours never need more
 CONTRAST_ROUNDS = 6  # to 2e-4 of the contrast
 

@@ -27,6 +27,7 @@ def scan_points(space: ParameterSpace) -> Tensor:
 
 
 def scan(residuals: Residuals, space: ParameterSpace) -> list[Tensor]:
-    """Evaluate the scan's points; return them best first. Costs one evaluation each; BudgetSpent ends it early."""
-    ranked = [(float(residuals.value(point).norm()), point) for point in scan_points(space)[: residuals.left]]
+    """Evaluate the scan's points; return them best first. One evaluation each, at most half the budget."""
+    affordable = scan_points(space)[: max(1, residuals.left // 2)]
+    ranked = [(float(residuals.value(point).norm()), point) for point in affordable]
     return [point for _, point in sorted(ranked, key=lambda pair: pair[0])]
