@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .PHONY: demo test test-slow lint bench clean
 
 demo: $(STAMP)
-	$(BIN)/torch-ssao report temple --size 240x180 --samples 256 --fit-views 0,1 --max-evaluations 90 --out out/demo
+	$(BIN)/torch-ssao report heap --size 240x180 --samples 256 --fit-views 0,1 --max-evaluations 90 --out out/demo
 	@echo "open out/demo/report.html"
 
 test: $(STAMP)

@@ -57,7 +57,8 @@ def fit(
         scan: False starts from the module's own values only.
         progress: show a bar on stderr; None for only when that is a terminal.
     Returns: a FitResult. Its standard errors propagate the target's own noise through the fit: `target.standard_error` where
-        there is one, else the size of each pixel's residual as if it were independent noise.
+        there is one, else the size of each pixel's residual as if it were independent noise. They do not cover what the
+        model cannot express: between views of a real scene the parameters scatter far more.
     Raises: ShapeError; RangeError for targets that are not finite, weights below 0, no pixel to fit, or starting
         values out of range; ChoiceError for unknown parameters; MissingExtraError without optimistix.
     Cost: `evaluations` forward passes of all views (a Jacobian column costs about one and a half); memory one view at a time.
