@@ -24,7 +24,11 @@ FIRST_DAMPING = 1e-2  # of the largest diagonal entry of J'J, Marquardt's tau
 APART = 0.7  # distance in logarithms below which two scan points lead to the same place
 POLISH_ROUNDS = 4  # rounds of evaluations kept back for the polish
 STARTS = 12
-WALKS = ((24, 0.05), (16, 0.006))  # points and spacing in log radius; the ripples seen are 0.02 to 0.4 long
+WALKS = (
+    (20, 0.05),
+    (12, 0.008),
+    (12, 0.0016),
+)  # points and spacing in log radius; the ripples seen are 0.01 to 0.4 long
 WALK_COST = sum(count for count, _ in WALKS)
 SAME = (
     5e-3,
