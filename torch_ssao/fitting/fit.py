@@ -22,7 +22,7 @@ from torch_ssao.gbuffer import GBuffer
 from torch_ssao.modules import AmbientVisibility
 
 BUDGET = {1: 60, 2: 100, 3: 180}  # evaluations by number of parameters: scan, descents and polish
-BUDGET_MANY = 400
+BUDGET_MANY = 700
 
 
 def fit(
@@ -52,7 +52,7 @@ def fit(
         parameters: names to fit; None for the module's `learnable` ones or, when it has none, all that it uses.
         weights: (B, 1, H, W) >= 0, importance of each pixel; None for all alike.
         valid: (B, 1, H, W) bool, further pixels to leave out; invalid pixels of the G-buffer never count.
-        max_evaluations: budget, every residual, Jacobian column and scan point counted as one; None for 60, 100, 180 or 400 by
+        max_evaluations: budget, every residual, Jacobian column and scan point counted as one; None for 60, 100, 180 or 700 by
             the number of parameters (1, 2, 3, more).
         scan: False starts from the module's own values only.
         progress: show a bar on stderr; None for only when that is a terminal.

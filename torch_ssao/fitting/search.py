@@ -23,7 +23,7 @@ WORTH = 1e-3
 FIRST_DAMPING = 1e-2  # of the largest diagonal entry of J'J, Marquardt's tau
 APART = 0.7  # distance in logarithms below which two scan points lead to the same place
 POLISH_ROUNDS = 4  # rounds of evaluations kept back for the polish
-STARTS = 12
+STARTS = 32
 WALKS = (
     (20, 0.05),
     (12, 0.008),
