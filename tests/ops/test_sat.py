@@ -39,7 +39,9 @@ def direct(image: torch.Tensor, cells: Lattice) -> torch.Tensor:
 
 @pytest.mark.parametrize("batch", [1, 3])
 @pytest.mark.parametrize("lines", [2, 3])
-@pytest.mark.parametrize(("height", "width", "block"), [(11, 7, 1), (1, 9, 1), (9, 1, 1), (1, 1, 1), (5, 6, 2), (3, 2, 4)])
+@pytest.mark.parametrize(
+    ("height", "width", "block"), [(11, 7, 1), (1, 9, 1), (9, 1, 1), (1, 1, 1), (5, 6, 2), (3, 2, 4)]
+)
 def test_cell_sums_are_exact_integrals(height: int, width: int, block: int, lines: int, batch: int) -> None:
     image = torch.rand(batch, 4, height, width, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     cells = lattice(2, (batch, 5, 10), (height * block, width * block), lines=lines, block=block)
@@ -116,7 +118,9 @@ def test_variance_is_never_negative(offset: float) -> None:
     samples = (torch.randint(0, 2, (1, 256, 256), generator=generator) * 1e-3 + offset).float()
     valid = torch.rand(1, 256, 256, generator=generator) > 0.1
     for half in (0.3, 2.0, 300.0):
-        windows = Lattice.around_pixels(torch.full((1, 2, 256, 256), half), (256, 256), rows=slice(0, 256), quadrants=True)
+        windows = Lattice.around_pixels(
+            torch.full((1, 2, 256, 256), half), (256, 256), rows=slice(0, 256), quadrants=True
+        )
         _, variance = sat.box_moments(samples, valid, windows)
         assert bool((variance >= 0).all())
         assert float(variance.max()) > 1e-7

@@ -21,9 +21,7 @@ def module(layers: int, *, variant: dict | None = None, **changes: float) -> ts.
     return net
 
 
-def oracle(
-    gb: ts.GBuffer, layers: int, eps: float, *, variant: dict | None = None, **changes: float
-) -> torch.Tensor:
+def oracle(gb: ts.GBuffer, layers: int, eps: float, *, variant: dict | None = None, **changes: float) -> torch.Tensor:
     v = VALUES | changes
     camera = gb.camera
     arrays = [t.double().numpy() for t in (camera.fx, camera.fy, camera.cx, camera.cy)]

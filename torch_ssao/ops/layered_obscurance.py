@@ -131,7 +131,9 @@ class LayeredObscurance:
 
     # ---- derivatives -------------------------------------------------------------------------------------------
 
-    def _derivatives(self, response: Response, boxes: Tensor, count: Tensor, rows: slice) -> tuple[Tensor, Tensor, Tensor]:
+    def _derivatives(
+        self, response: Response, boxes: Tensor, count: Tensor, rows: slice
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """d VO / d (sums of this layer) (B, Q, 4, rows, W), d VO / d rise and d VO / d slope (B, Q, rows, W)."""
         boxes, count = boxes[:, :, rows].double(), count[:, :, rows].double()
         held = (count > 0).sum(1, keepdim=True).clamp(min=1)
@@ -155,7 +157,9 @@ class LayeredObscurance:
         soft = SoftPartition(samples, self.settings.layers, queries.width) if self._is_soft() else None
         decisions = soft.zeros() if soft else None
         to_position = samples.position.new_zeros(samples.position.shape)
-        to_normal, to_half = (torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (queries.normal, queries.half))
+        to_normal, to_half = (
+            torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (queries.normal, queries.half)
+        )
         to_rise_sum = torch.zeros_like(grad, dtype=torch.float64)
         to_box, to_slope = (torch.zeros_like(t, dtype=torch.float64) for t in (queries.box_height, queries.slope))
         for leaf in self._leaves(labels):
@@ -186,7 +190,15 @@ class LayeredObscurance:
             to_depth, to_sample_half = soft.pull_back(decisions)
             to_position[:, 2] += to_depth.to(to_position.dtype)
         to_centre = (-to_rise_sum[:, None] * queries.normal).to(to_position.dtype)
-        return [to_position, to_sample_half, to_centre, to_normal, to_half, to_box.to(grad.dtype), to_slope.to(grad.dtype)]
+        return [
+            to_position,
+            to_sample_half,
+            to_centre,
+            to_normal,
+            to_half,
+            to_box.to(grad.dtype),
+            to_slope.to(grad.dtype),
+        ]
 
     def push_forward(self, tangents: dict[str, Tensor | None], labels: Tensor, boxes: Tensor, count: Tensor) -> Tensor:
         """Tangent of the obscurance, (B, H, W).
@@ -197,7 +209,9 @@ class LayeredObscurance:
         samples, queries = self.samples, self.queries
         position, half = tangents["position"], tangents["half"]
         soft = SoftPartition(samples, self.settings.layers, queries.width) if self._is_soft() else None
-        decisions = soft.push_forward(None if position is None else position[:, 2], tangents["sample_half"]) if soft else None
+        decisions = (
+            soft.push_forward(None if position is None else position[:, 2], tangents["sample_half"]) if soft else None
+        )
         total = torch.zeros_like(queries.seen, dtype=torch.float64)
         for leaf in self._leaves(labels):
             moving = self._moving_table(leaf, position, soft, decisions)
@@ -260,4 +274,3 @@ class LayeredObscurance:
 
     def _is_soft(self) -> bool:
         return self.settings.gradient == "surrogate" and self.settings.layers > 1
-

@@ -55,7 +55,9 @@ def sample_table(samples: Samples, centre: Tensor, member: Tensor) -> Tensor:
     return sat.accumulate(table)
 
 
-def _descend(samples: Samples, centre: Tensor, labels: Tensor, table: Tensor, *, first: int, count: int) -> Iterator[Leaf]:
+def _descend(
+    samples: Samples, centre: Tensor, labels: Tensor, table: Tensor, *, first: int, count: int
+) -> Iterator[Leaf]:
     """The leaves below a node that holds the labels first ... first + count - 1; the node's table is used up."""
     if count == 1:
         yield Leaf(first, (samples.mass > 0) & (labels == first), table)

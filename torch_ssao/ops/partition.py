@@ -49,7 +49,11 @@ class Samples:
         """The samples' own windows, block of rows by block of rows of the L stacked images."""
         half = self.half.flatten(2, 3)
         rows, columns = half.shape[2:]
-        blocks = sat.scatter_blocks(rows, columns) if scatter else sat.row_blocks(slice(0, rows), columns, values, half.device)
+        blocks = (
+            sat.scatter_blocks(rows, columns)
+            if scatter
+            else sat.row_blocks(slice(0, rows), columns, values, half.device)
+        )
         for part in blocks:
             yield (
                 part,

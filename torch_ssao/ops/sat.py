@@ -14,7 +14,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-BLOCK_BYTES = {"cpu": 1 << 21, "cuda": 1 << 28}  # of looked-up values at a time: what a core's cache, a GPU's memory holds
+BLOCK_BYTES = {
+    "cpu": 1 << 21,
+    "cuda": 1 << 28,
+}  # of looked-up values at a time: what a core's cache, a GPU's memory holds
 SCATTER_BLOCKS = 16  # an image is scattered in at most so many blocks of rows: each needs a zeroed band of the table
 SCATTER_MIN = 1 << 15  # queries a scatter block has at least
 
@@ -34,7 +37,13 @@ class Lattice:
 
     @staticmethod
     def around_pixels(
-        half: Tensor, size: tuple[int, int], *, rows: slice, block: int = 1, coarse: bool = False, quadrants: bool = False
+        half: Tensor,
+        size: tuple[int, int],
+        *,
+        rows: slice,
+        block: int = 1,
+        coarse: bool = False,
+        quadrants: bool = False,
     ) -> Lattice:
         """Windows centred on pixels, clipped to the image.
 

@@ -39,7 +39,9 @@ class SoftPartition:
 
     def zeros(self) -> Tensor:
         """(rounds, B, L, h, w): cotangents of the decisions, before any."""
-        return torch.zeros((self.rounds, *self.samples.mass.shape), dtype=self.samples.position.dtype, device=self.paths.device)
+        return torch.zeros(
+            (self.rounds, *self.samples.mass.shape), dtype=self.samples.position.dtype, device=self.paths.device
+        )
 
     def add_membership_cotangent(self, to_decisions: Tensor, to_member: Tensor, level: int, node: int) -> None:
         """Pass the cotangent of a node's memberships on to the rounds above it, in place."""
@@ -72,7 +74,9 @@ class SoftPartition:
                 for rows, lattice in samples.windows(12, scatter=True):
                     total, count = sat.cell_sums(table, lattice)[:, 0].unbind(1)
                     count = partition.pixels(count)
-                    here = torch.where(member.flatten(1, 2)[:, rows], to_decisions[level].flatten(1, 2)[:, rows].double(), 0.0)
+                    here = torch.where(
+                        member.flatten(1, 2)[:, rows], to_decisions[level].flatten(1, 2)[:, rows].double(), 0.0
+                    )
                     here = here * self._steepness(apart.flatten(1, 2)[:, rows], total / count)
                     to_depth.flatten(1, 2)[:, rows] -= here
                     to_sums = torch.stack((here / count, -here * total / count.square()), 1)[:, None]
@@ -100,7 +104,11 @@ class SoftPartition:
                 member = partition.kept & ((self.paths[0] >> (self.rounds - level)) == node)
                 table = partition.table(member)
                 joined = mass * self.membership_tangent(decisions, level, node)
-                moved = joined * apart if depth is None else joined * apart + torch.where(member, mass * depth.double(), 0.0)
+                moved = (
+                    joined * apart
+                    if depth is None
+                    else joined * apart + torch.where(member, mass * depth.double(), 0.0)
+                )
                 moving = sat.summed_area_table(torch.stack((moved.sum(1), joined.sum(1)), 1))
                 for rows, lattice in samples.windows(24):
                     total, count = sat.cell_sums(table, lattice)[:, 0].unbind(1)
