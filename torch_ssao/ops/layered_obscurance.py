@@ -165,19 +165,20 @@ class LayeredObscurance:
         for leaf in self._leaves(labels):
             to_table = torch.zeros_like(leaf.table)
             for outer in sat.scatter_blocks(*grad.shape[1:]):
-                to_sums = []
+                to_sums = leaf.table.new_empty((*boxes.shape[:2], 4, outer.stop - outer.start, grad.shape[2]))
                 for rows, lattice in self._windows(outer):
                     response = self._respond(sat.cell_sums(leaf.table, lattice), rows)
                     sums, rise, slope = self._derivatives(response, boxes, count, rows)
                     weight = grad[:, None, rows].double()
-                    to_sums.append(sums * weight[:, :, None])
+                    inside = slice(rows.start - outer.start, rows.stop - outer.start)
+                    torch.mul(sums, weight[:, :, None], out=to_sums[:, :, :, inside])
                     rise = rise * weight
                     to_rise_sum[:, rows] += rise.sum(1)
                     to_normal[:, :, rows] += (rise[:, :, None] * response.mean).sum(1)
                     to_box -= (rise * response.height).flatten(1).sum(1)
                     to_slope += (slope * weight).flatten(1).sum(1)
                 lattice = self._lattice(outer)
-                lines = sat.cell_sums_pull_back(torch.cat(to_sums, 3), leaf.table, lattice, to_table)
+                lines = sat.cell_sums_pull_back(to_sums, leaf.table, lattice, to_table)
                 to_half[:, :, outer] += half_from_lines(*lines, lattice, samples.size)
             to_samples = sat.summed_area_table_adjoint(to_table)
             for axis in range(3):

@@ -153,9 +153,9 @@ class Partition:
     @staticmethod
     def pixels(count: Tensor) -> Tensor:
         """Mass that is safe to divide by: a window without samples of the node decides nothing that matters."""
-        return count.clamp(min=1e-12)
+        return count.clamp(min=EMPTY)
 
     def _is_lower(self, rows: slice, mean: Tensor, count: Tensor) -> Tensor:
         depth = self.samples.position[:, 2].flatten(1, 2)[:, rows].double()
         slack = self.eps * depth.abs() + self.lost / count
-        return (depth - self.centre[:, 0] >= mean - slack).to(torch.uint8)
+        return ((depth - self.centre[:, 0] >= mean - slack) | (count <= EMPTY)).to(torch.uint8)

@@ -18,8 +18,8 @@ BLOCK_BYTES = {
     "cpu": 1 << 21,
     "cuda": 1 << 28,
 }  # of looked-up values at a time: what a core's cache, a GPU's memory holds
-SCATTER_BLOCKS = 16  # an image is scattered in at most so many blocks of rows: each needs a zeroed band of the table
-SCATTER_MIN = 1 << 15  # queries a scatter block has at least
+SCATTER_BLOCKS = 32  # an image is scattered in at most so many blocks of rows: each needs a zeroed band of the table
+SCATTER_MIN = 1 << 14  # queries a scatter block has at least
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,8 @@ def cell_sums_pull_back(
     Cost: about 5 C additions a corner, plus one zeroed band of the table for each horizontal line.
     """
     batch, channels, height, width = table.shape
-    to_corners = _corners(to_sums)  # (B, Ky, Kx, C, R, S)
+    side = len(lattice.xs) - 1
+    cells = to_sums.unflatten(1, (side, side))
     to_x = [torch.zeros_like(line) for line in lattice.xs]
     to_y = [torch.zeros_like(line) for line in lattice.ys]
     grid_x = torch.stack([line * (2 / ((width - 1) * lattice.block)) - 1 for line in lattice.xs], 1)  # (B, Kx, R, S)
@@ -178,7 +179,7 @@ def cell_sums_pull_back(
         span = (high - low - 1) * lattice.block
         grid_y = ((line - low * lattice.block) * (2 / span) - 1)[:, None].expand_as(grid_x)
         grid = torch.stack((grid_x, grid_y), -1).flatten(1, 2)
-        cotangent = to_corners[:, j].transpose(1, 2).flatten(2, 3)  # (B, C, Kx R, S)
+        cotangent = _line_cotangent(cells, j).transpose(1, 2).flatten(2, 3)  # (B, C, Kx R, S)
         to_part, to_grid = _lookup_backward(cotangent, part, grid)
         to_table[:, :, low:high] += to_part
         to_grid = to_grid.view(*grid_x.shape, 2)
@@ -193,7 +194,9 @@ def edge_slopes(to_sums: Tensor, table: Tensor, lattice: Lattice) -> tuple[tuple
     _, _, height, width = table.shape
     grid = lattice.grid(height - 1, width - 1)
     corners, batch, rows, columns, _ = grid.shape
-    cotangent = _corners(to_sums).permute(0, 3, 1, 2, 4, 5).flatten(2, 4)
+    cells = to_sums.unflatten(1, (len(lattice.ys) - 1, -1))
+    lines = [_line_cotangent(cells, j) for j in range(len(lattice.ys))]
+    cotangent = torch.stack(lines, 1).permute(0, 3, 1, 2, 4, 5).flatten(2, 4)
     _, to_grid = _lookup_backward(cotangent, table, grid.transpose(0, 1).flatten(1, 2), to_input=False)
     to_grid = to_grid.view(batch, len(lattice.ys), len(lattice.xs), rows, columns, 2)
     along_x, along_y = to_grid[..., 0].sum(1), to_grid[..., 1].sum(2)
@@ -246,14 +249,13 @@ def _cells(values: Tensor, columns: int, rows: int) -> Tensor:
     return values.diff(dim=1).diff(dim=2).flatten(1, 2)
 
 
-def _corners(to_sums: Tensor) -> Tensor:
-    """Adjoint of `_cells`: (B, Q, C, R, S) -> (B, Ky, Kx, C, R, S)."""
-    side = 2 if to_sums.shape[1] == 4 else 1
-    cells = to_sums.unflatten(1, (side, side))
-    for dim in (1, 2):
-        edge = torch.zeros_like(cells.narrow(dim, 0, 1))
-        cells = torch.cat((edge, cells), dim) - torch.cat((cells, edge), dim)
-    return cells
+def _line_cotangent(cells: Tensor, line: int) -> Tensor:
+    """Adjoint of `_cells` at one horizontal line: (B, Qy, Qx, C, R, S) cell cotangents -> (B, Kx, C, R, S)."""
+    above = cells[:, line - 1] if line > 0 else 0
+    below = cells[:, line] if line < cells.shape[1] else 0
+    row = above - below
+    edge = torch.zeros_like(row[:, :1])
+    return torch.cat((edge, row), 1) - torch.cat((row, edge), 1)
 
 
 def _band(line: Tensor, block: int, height: int) -> tuple[int, int]:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torch_ssao.ops import sat
-from torch_ssao.ops.partition import Partition, Samples
+from torch_ssao.ops.partition import EMPTY, Partition, Samples
 
 
 class SoftPartition:
@@ -121,7 +121,8 @@ class SoftPartition:
                     if depth is not None:
                         tangent -= depth.flatten(1, 2)[:, rows]
                     tangent *= self._steepness(apart.flatten(1, 2)[:, rows], total / count)
-                    decision.flatten(1, 2)[:, rows] += torch.where(member.flatten(1, 2)[:, rows], tangent, 0.0)
+                    decided = member.flatten(1, 2)[:, rows] & (count > EMPTY)
+                    decision.flatten(1, 2)[:, rows] += torch.where(decided, tangent, 0.0)
             decisions.append(decision)
         return decisions
 
