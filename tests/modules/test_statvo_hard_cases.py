@@ -49,7 +49,7 @@ every_config = pytest.mark.parametrize("config", configs())
 
 
 def build(config: Config, radius: float = 0.5) -> ts.StatVO:
-    """The module of a configuration, all parameters learnable and none at its default; choices only where they differ."""
+    """The module of a configuration, all parameters learnable, none at its default; choices where they differ."""
     choices = {name: value for name, value in config._asdict().items() if value != DEFAULTS[name]}
     return ts.StatVO(radius, height=0.7, falloff=0.8, contrast=1.3, learnable="all", **choices)
 

@@ -13,7 +13,7 @@ numbers are obscurances, 1 - visibility, and fractions of a volume over the surf
   what StatVO estimates. A parallel ray that passes the edge w behind it (on the floor's plane) sees the other face at
   height k w, k = 1 / (tan theta - cot beta). The window reaches to w = q / cos theta, q = 1 - s cos theta, and up to
   the height Y = k q / cos theta. Occupancy: k q^2 / (4 h cos theta) for Y <= h, else (q - h cos theta / (2 k)) / 2.
-  On a wall k = cot theta: q^2 / (4 h sin theta), else (q - h sin theta / 2) / 2. Seen along the normal it is the upright
+  On a wall k = cot theta: q^2 / (4 h sin theta), else (q - h sin theta / 2) / 2. Along the normal it is the upright
   box; in contact with a wall it is 1 / (4 h sin theta), or 1 / 2 - h sin theta / 4, where ball and box are 1 / 2.
 - A pinhole D high over the floor and e from the wall, looking down, sees heights D w / (e + w): their mean is
   D / 2 (W - e ln(1 + W / e)), W = 1 - s.
@@ -54,7 +54,7 @@ PIXELS = 2e-4
 
 
 def camera_over_edge(theta_deg: float, height: int, width: int) -> ts.Camera:
-    """Parallel view of the floor beside the edge x = 0, tilted by theta towards it; the edge lies level in the image."""
+    """Parallel view of the floor beside the edge x = 0, tilted by theta towards it; the edge is level in the image."""
     theta = math.radians(theta_deg)
     focus, z = (torch.tensor(v, dtype=torch.float64) for v in ([0.5, 0.0, 0.0], [0.0, 0.0, 1.0]))
     out = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
@@ -374,7 +374,7 @@ def test_ceiling_is_filled_below_and_not_above(layers: int) -> None:
 
 
 def test_heights_below_the_floor_count_as_negative() -> None:
-    # Strips of three columns, 0.5 above, level with and 0.3 below the middle one, seen along the normal; R = 4.5 pixels.
+    # Strips of three columns, 0.5 above, level with and 0.3 below the middle one, along the normal; R = 4.5 pixels.
     depth = torch.tensor([1.5, 2.0, 2.3], dtype=torch.float64).repeat_interleave(3).expand(1, 1, 9, 9).contiguous()
     camera = ts.Camera.orthographic(torch.tensor(2.0, dtype=torch.float64), 9, 9)
     towards_eye = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).view(1, 3, 1, 1).expand(1, 3, 9, 9)

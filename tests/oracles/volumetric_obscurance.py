@@ -5,7 +5,7 @@ The reference of the paper's Fig. 13 (256 points a pixel, no blur), with three v
 - "ball": the half-ball of radius R about the normal;
 - "box": the upright box of Fig. 7c, half-size R across the tangent plane along the image's axes, h R along the normal;
 - "prism": the volume that StatVO averages over. Its section is the pixel's window on the screen (half-size f R / z
-  pixels), its sides are the view rays through the window's edge, and it is filled up to the height h R along the normal.
+  pixels), its sides are the view rays through the window's edge, and its top is at the height h R along the normal.
 
 A point is occupied where the image holds a surface in front of it. All three lie above the surface, so a plane gives
 visibility 1. Points are a Hammersley set, shifted around the unit cube by an offset of each pixel's own (seeded), so
