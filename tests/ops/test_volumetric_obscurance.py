@@ -103,7 +103,7 @@ def sampled(gb: ts.GBuffer, shape: str, radius: float, **options: Any) -> tuple[
 
 
 def statvo(gb: ts.GBuffer, radius: float, **options: Any) -> Floats:
-    return 1.0 - ts.StatVO(radius, **options).double()(gb)[0, 0].detach().numpy()
+    return 1.0 - ts.StatVO(radius, **({"quadrants": False} | options)).double()(gb)[0, 0].detach().numpy()
 
 
 def psi(s: npt.ArrayLike, slope: float = 1.0) -> Floats:
