@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 import torch_ssao as ts
+from oracles.statvo import statvo_visibility
 from support.gbuffers import random_gbuffer
 
 
@@ -209,3 +210,30 @@ def test_a_broadcast_depth_is_a_constant_depth(config: Config) -> None:
     visibility.sum().backward()
     assert number.grad is not None
     assert torch.isfinite(number.grad)
+
+
+@pytest.mark.parametrize("quadrants", [False, True])
+@pytest.mark.parametrize("radius", [0.05, 0.2])
+def test_blocks_whose_windows_miss_the_image_are_not_split(radius: float, quadrants: bool) -> None:
+    # 13 rows in blocks of 4: the last blocks are centred a row below the image, which a small window does not reach.
+    gb = random_gbuffer(100, height=13, width=18)
+    assert gb.normal is not None
+    net = ts.StatVO(layers=4, quadrants=quadrants, sat_scale=4).double()
+    net.radius = radius
+    camera = [getattr(gb.camera, name).numpy() for name in ("fx", "fy", "cx", "cy")]
+    expected = statvo_visibility(
+        gb.depth.numpy(),
+        gb.valid_mask.numpy(),
+        gb.normal.numpy(),
+        *camera,
+        False,
+        radius=radius,
+        height=1.0,
+        slope=1.0,
+        contrast=1.0,
+        layers=4,
+        eps=torch.finfo(torch.float64).eps,
+        quadrants=quadrants,
+        sat_scale=4,
+    )
+    torch.testing.assert_close(net(gb)[:, 0], torch.from_numpy(expected), atol=1e-9, rtol=0)
