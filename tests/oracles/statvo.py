@@ -60,7 +60,7 @@ class Samples(NamedTuple):
     size: tuple[int, int]  # of the image in pixels: height, width
 
     def weights(self, rectangle: Rectangle) -> tuple[slice, slice, Floats]:
-        """Rows and columns of the blocks a rectangle touches, and the pixels it holds of each sample (L, rows, columns).
+        """Rows and columns of the blocks a rectangle touches, and its pixels of each sample (L, rows, columns).
 
         The rectangle is clipped to the image; a block's mass lies evenly on all of it, also on what sticks out.
         """
