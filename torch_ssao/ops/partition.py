@@ -12,6 +12,7 @@ from torch_ssao.ops import sat
 from torch_ssao.ops.sat import Lattice
 
 ROUNDING = 8.0  # depths and heights within this many units of rounding count as equal: a plane must not split itself
+EMPTY = 1e-12  # pixels of a node in a window below which there is no mean to compare with: the sample counts as lower
 MIN_COUNT = 1e-6  # pixels of a layer inside a window below which its mean is all rounding: the layer is left out
 
 

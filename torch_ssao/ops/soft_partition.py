@@ -74,9 +74,8 @@ class SoftPartition:
                 for rows, lattice in samples.windows(12, scatter=True):
                     total, count = sat.cell_sums(table, lattice)[:, 0].unbind(1)
                     count = partition.pixels(count)
-                    here = torch.where(
-                        member.flatten(1, 2)[:, rows], to_decisions[level].flatten(1, 2)[:, rows].double(), 0.0
-                    )
+                    decided = member.flatten(1, 2)[:, rows] & (count > EMPTY)
+                    here = torch.where(decided, to_decisions[level].flatten(1, 2)[:, rows].double(), 0.0)
                     here = here * self._steepness(apart.flatten(1, 2)[:, rows], total / count)
                     to_depth.flatten(1, 2)[:, rows] -= here
                     to_sums = torch.stack((here / count, -here * total / count.square()), 1)[:, None]
