@@ -1,0 +1,171 @@
+"""How many layers: adaptive against uniform, error by layers, coarser tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch_ssao as ts
+from benchmarks.statvo_claims.common import (
+    Candidate,
+    Case,
+    builtin_case,
+    fitted,
+    median_footprint,
+    medians_ms,
+    visibility,
+)
+from benchmarks.statvo_claims.obscurance import point_sampled
+from benchmarks.statvo_claims.pictures import curve_axes, strip
+
+FIT_HEIGHT = 120
+TIME_HEIGHT = 240
+SCALE_HEIGHT = 240
+DEMANDED = ("temple", "street")
+ADAPTIVE = tuple(Candidate(n) for n in (1, 2, 4, 8))
+UNIFORM = tuple(Candidate(n, "uniform") for n in (4, 16, 64))
+QUADRANTS = (Candidate(4, quadrants=True), Candidate(64, "uniform", quadrants=True))
+EVERY = (*ADAPTIVE, *UNIFORM, *QUADRANTS)
+FOUR, SIXTY_FOUR = ADAPTIVE[2], UNIFORM[2]
+
+
+def layers(figures: Path) -> tuple[list[dict[str, Any]], str]:
+    """Four adaptive layers against 64 uniform: error against point-sampled obscurance and against rays, and time."""
+    rows: list[dict[str, Any]] = []
+    for name in ts.scenes.names():
+        train, test = builtin_case(name, 0, FIT_HEIGHT), builtin_case(name, 1, FIT_HEIGHT)
+        obscurance = [point_sampled(c.gbuffer, c.radius) for c in (train, test)]
+        times = _times(name, repeats=5)
+        for candidate, took in zip(EVERY, times, strict=True):
+            plain = candidate.build(train.radius)
+            row = {"scene": name} | candidate.row() | {"time": took}
+            row["vo_unfitted"] = [
+                c.error(visibility(plain, c.gbuffer), o) for c, o in zip((train, test), obscurance, strict=True)
+            ]
+            for key, target in (("vo_fitted", obscurance[0]), ("rays_fitted", None)):
+                module, error = fitted(candidate, train, target)
+                judge = test.error(visibility(module, test.gbuffer), obscurance[1] if key == "vo_fitted" else None)
+                row[key] = [error, judge]
+                row[f"{key}_values"] = module.values()
+            rows.append(row)
+            _print_layers(row)
+    _layers_picture(figures, rows)
+    return rows, _layers_statement(rows)
+
+
+def _times(name: str, repeats: int) -> list[dict[str, float]]:
+    where = builtin_case(name, 0, TIME_HEIGHT)
+    modules = [candidate.build(where.radius) for candidate in EVERY]
+    return medians_ms([lambda m=m: visibility(m, where.gbuffer) for m in modules], repeats)
+
+
+def _print_layers(row: dict[str, Any]) -> None:
+    print(
+        f"{row['scene']:7} {row['layers']:3} {row['layering']:8} {'q' if row['quadrants'] else ' '} vo plain {row['vo_unfitted'][0]:.4f} "
+        f"{row['vo_unfitted'][1]:.4f}  vo fitted {row['vo_fitted'][0]:.4f} {row['vo_fitted'][1]:.4f}  "
+        f"rays {row['rays_fitted'][0]:.4f} {row['rays_fitted'][1]:.4f}  {row['time']['median_ms']:.0f} ms",
+        flush=True,
+    )
+
+
+def _pick(rows: list[dict[str, Any]], scene: str, candidate: Candidate) -> dict[str, Any]:
+    return next(r for r in rows if r["scene"] == scene and r.items() >= candidate.row().items())
+
+
+def _layers_statement(rows: list[dict[str, Any]]) -> str:
+    parts = []
+    for name in ts.scenes.names():
+        few, many = _pick(rows, name, FOUR), _pick(rows, name, SIXTY_FOUR)
+        ratios = {key: few[key][0] / many[key][0] for key in ("vo_unfitted", "vo_fitted", "rays_fitted")}
+        held = {key: few[key][1] / many[key][1] for key in ("vo_fitted", "rays_fitted")}
+        speed = many["time"]["median_ms"] / few["time"]["median_ms"]
+        parts.append(
+            f"{name}: error of 4 adaptive over 64 uniform {ratios['vo_unfitted']:.2f} (obscurance, same parameters), "
+            f"{ratios['vo_fitted']:.2f} (obscurance, fitted; other view {held['vo_fitted']:.2f}), "
+            f"{ratios['rays_fitted']:.2f} (rays, fitted; other view {held['rays_fitted']:.2f}), {speed:.1f} times faster"
+        )
+    return "; ".join(parts)
+
+
+def _layers_picture(figures: Path, rows: list[dict[str, Any]]) -> None:
+    """Temple and street: one layer, 64 uniform, four adaptive, point-sampled obscurance, rays."""
+    lines = []
+    for name in DEMANDED:
+        where = builtin_case(name, 0, FIT_HEIGHT)
+        line = []
+        for candidate in (ADAPTIVE[0], SIXTY_FOUR, FOUR):
+            values = _pick(rows, name, candidate)["rays_fitted_values"]
+            module = candidate.build(**values)
+            image = visibility(module, where.gbuffer)
+            line.append((f"{candidate.label}, RMSE {where.error(image):.3f}", image))
+        lines.append([*line, ("ray-traced", where.truth.visibility)])
+    strip(figures / "statvo_layers.png", lines, names=DEMANDED, title="fitted to the rays (height, falloff, contrast)")
+
+
+def monotone(figures: Path) -> tuple[list[dict[str, Any]], str]:
+    """Fitted error against rays for 1, 2, 4 layers, one region and quadrants, every built-in scene."""
+    rows, words = [], []
+    lines: dict[str, tuple[list[float], list[float]]] = {}
+    for name in ts.scenes.names():
+        train, test = builtin_case(name, 0, FIT_HEIGHT), builtin_case(name, 1, FIT_HEIGHT)
+        for quadrants in (False, True):
+            errors = []
+            for count in (1, 2, 4):
+                module, error = fitted(Candidate(count, quadrants=quadrants), train)
+                errors.append(error)
+                row = {"scene": name, "layers": count, "quadrants": quadrants, "rmse": error}
+                row["rmse_other_view"] = test.error(visibility(module, test.gbuffer))
+                row["constant_rmse"] = _constant(train)
+                rows.append(row | {"values": module.values()})
+            falls = errors[0] > errors[1] > errors[2]
+            kind = "quadrants" if quadrants else "one region"
+            words.append(f"{name} ({kind}): {' > '.join(f'{e:.4f}' for e in errors) if falls else _not(errors)}")
+            print(words[-1], flush=True)
+            if not quadrants:
+                lines[name] = ([1, 2, 4], errors)
+    title = "fitted error against rays, one region"
+    curve_axes(
+        figures / "statvo_monotone.png", lines, x="adaptive layers", y="RMSE of visibility", title=title, log_x=True
+    )
+    return rows, "; ".join(words)
+
+
+def _not(errors: list[float]) -> str:
+    return "does not fall: " + ", ".join(f"{e:.4f}" for e in errors)
+
+
+def _constant(where: Case) -> float:
+    """RMSE of the best constant image: the floor that a technique has to beat."""
+    return float(where.truth.visibility[where.valid].std(correction=0))
+
+
+def scale(figures: Path) -> tuple[list[dict[str, Any]], str]:
+    """Tables of half and quarter resolution: error against full ones, against obscurance and against rays, and time."""
+    rows, words, lines = [], [], []
+    for name in ts.scenes.names():
+        where = builtin_case(name, 0, SCALE_HEIGHT)
+        values = fitted(FOUR, builtin_case(name, 0, FIT_HEIGHT))[0].values()
+        obscurance = point_sampled(where.gbuffer, **values)
+        modules = [Candidate(4, sat_scale=s).build(**values) for s in (1, 2, 4)]
+        images = [visibility(m, where.gbuffer) for m in modules]
+        times = medians_ms([lambda m=m, g=where.gbuffer: visibility(m, g) for m in modules], 5)
+        for s, image, took in zip((1, 2, 4), images, times, strict=True):
+            row = {"scene": name, "sat_scale": s, "footprint_px": median_footprint(where), "time": took}
+            row |= {"rmse_full": where.error(image, images[0]), "rmse_vo": where.error(image, obscurance)}
+            row |= {"rmse_rays": where.error(image), "worst_full": float((image - images[0]).abs().max())}
+            rows.append(row)
+        one, two, four = rows[-3:]
+        words.append(
+            f"{name}: half and quarter differ from full by {two['rmse_full']:.4f} and {four['rmse_full']:.4f} RMSE; "
+            f"against rays {one['rmse_rays']:.4f}, {two['rmse_rays']:.4f}, {four['rmse_rays']:.4f}; "
+            f"against obscurance {one['rmse_vo']:.4f}, {two['rmse_vo']:.4f}, {four['rmse_vo']:.4f}; "
+            f"{one['time']['median_ms'] / two['time']['median_ms']:.1f} and "
+            f"{one['time']['median_ms'] / four['time']['median_ms']:.1f} times faster"
+        )
+        print(words[-1], flush=True)
+        if name in DEMANDED:
+            captions = ("full SATs", "half", "quarter")
+            line = [(f"{c}, RMSE {where.error(i):.3f}", i) for c, i in zip(captions, images, strict=True)]
+            lines.append([*line, ("ray-traced", where.truth.visibility)])
+    strip(figures / "statvo_scale.png", lines, names=DEMANDED, title="four adaptive layers")
+    return rows, "; ".join(words)
