@@ -1,4 +1,4 @@
-"""Summed-area tables: exact sums, exact edge derivatives, exact adjoints."""
+"""Summed-area tables: exact sums over lattices, exact derivatives of their lines, exact adjoints."""
 
 from __future__ import annotations
 
@@ -6,75 +6,117 @@ import pytest
 import torch
 
 from torch_ssao.ops import sat
-from torch_ssao.ops.sat import Window
+from torch_ssao.ops.sat import Lattice
 
 
-def windows(seed: int, count: int, height: int, width: int) -> Window:
+def lattice(seed: int, shape: tuple[int, int, int], size: tuple[int, int], *, lines: int, block: int = 1) -> Lattice:
+    """Random sorted lines of (B, R, S) queries inside an image."""
     generator = torch.Generator().manual_seed(seed)
-    x = (torch.rand(2, count, 2, generator=generator, dtype=torch.float64) * width).sort(-1).values
-    y = (torch.rand(2, count, 2, generator=generator, dtype=torch.float64) * height).sort(-1).values
-    return Window(x[..., 0], x[..., 1], y[..., 0], y[..., 1], height, width)
+    sides = []
+    for extent in (size[1], size[0]):
+        position = torch.rand(lines, *shape, generator=generator, dtype=torch.float64) * extent
+        sides.append(tuple(position.sort(0).values))
+    return Lattice(*sides, block)
 
 
-def overlap(low: torch.Tensor, high: torch.Tensor, size: int) -> torch.Tensor:
-    """Length of [low, high] inside each unit cell."""
-    cell = torch.arange(size, dtype=torch.float64)
-    return (torch.minimum(high[..., None], cell + 1) - torch.maximum(low[..., None], cell)).clamp(min=0)
+def overlap(low: torch.Tensor, high: torch.Tensor, entries: int, block: int = 1) -> torch.Tensor:
+    """Share of each table entry along one axis that [low, high] covers."""
+    start = torch.arange(entries, dtype=torch.float64) * block
+    covered = torch.minimum(high[..., None], start + block) - torch.maximum(low[..., None], start)
+    return covered.clamp(min=0) / block
 
 
-@pytest.mark.parametrize(("height", "width"), [(11, 7), (1, 9), (9, 1), (1, 1)])
-def test_box_sum_is_the_exact_integral(height: int, width: int) -> None:
-    image = torch.rand(2, height, width, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    window = windows(2, 50, height, width)
-    sums = sat.box_sum(sat.summed_area_table(image), window)
-    weight_x, weight_y = overlap(window.x0, window.x1, width), overlap(window.y0, window.y1, height)
-    expected = torch.einsum("bhwc,bnh,bnw->bnc", image, weight_y, weight_x)
-    torch.testing.assert_close(sums, expected, atol=1e-12, rtol=0)
+def direct(image: torch.Tensor, cells: Lattice) -> torch.Tensor:
+    """Cell sums entry by entry."""
+    height, width = image.shape[2:]
+    sums = []
+    for y0, y1 in zip(cells.ys[:-1], cells.ys[1:], strict=True):
+        for x0, x1 in zip(cells.xs[:-1], cells.xs[1:], strict=True):
+            across, down = overlap(x0, x1, width, cells.block), overlap(y0, y1, height, cells.block)
+            sums.append(torch.einsum("bchw,brsh,brsw->bcrs", image, down, across))
+    return torch.stack(sums, 1)
 
 
-def test_edge_derivatives_match_differences() -> None:
-    image = torch.rand(2, 8, 9, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    table = sat.summed_area_table(image)
-    window = windows(5, 40, 8, 9)
-    edges = (window.x0, window.x1, window.y0, window.y1)
-
-    def at(index: int, step: float) -> torch.Tensor:
-        moved = [edge + step if i == index else edge for i, edge in enumerate(edges)]
-        return sat.box_sum(table, Window(*moved, 8, 9))
-
-    for index, strip in enumerate(sat.box_sum_edges(table, window)):
-        numeric = (at(index, 1e-7) - at(index, -1e-7)) / 2e-7
-        torch.testing.assert_close(strip, numeric, atol=1e-6, rtol=0)
+@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("lines", [2, 3])
+@pytest.mark.parametrize(("height", "width", "block"), [(11, 7, 1), (1, 9, 1), (9, 1, 1), (1, 1, 1), (5, 6, 2), (3, 2, 4)])
+def test_cell_sums_are_exact_integrals(height: int, width: int, block: int, lines: int, batch: int) -> None:
+    image = torch.rand(batch, 4, height, width, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    cells = lattice(2, (batch, 5, 10), (height * block, width * block), lines=lines, block=block)
+    torch.testing.assert_close(
+        sat.cell_sums(sat.summed_area_table(image), cells), direct(image, cells), atol=1e-12, rtol=0
+    )
 
 
-def test_adjoints_are_transposes() -> None:
+@pytest.mark.parametrize("batch", [1, 2])
+@pytest.mark.parametrize("lines", [2, 3])
+@pytest.mark.parametrize("block", [1, 2])
+def test_pull_back_is_the_transpose_and_lines_match_differences(lines: int, batch: int, block: int) -> None:
     generator = torch.Generator().manual_seed(4)
-    image = torch.rand(2, 6, 5, 3, generator=generator, dtype=torch.float64)
-    window = windows(6, 30, 6, 5)
+    image = torch.rand(batch, 2, 8, 9, generator=generator, dtype=torch.float64)
     table = sat.summed_area_table(image)
-    cotangent = torch.randn(2, 30, 3, generator=generator, dtype=torch.float64)
-    pulled = sat.box_sum_adjoint(cotangent, window)
-    left = (sat.box_sum(table, window) * cotangent).sum()
-    torch.testing.assert_close((table * pulled).sum(), left)
-    torch.testing.assert_close((image * sat.summed_area_table_adjoint(pulled)).sum(), left)
+    cells = lattice(5, (batch, 6, 7), (8 * block, 9 * block), lines=lines, block=block)
+    sums = sat.cell_sums(table, cells)
+    cotangent = torch.randn(sums.shape, generator=generator, dtype=torch.float64)
+    to_table = torch.zeros_like(table)
+    to_x, to_y = sat.cell_sums_pull_back(cotangent, table, cells, to_table)
+    loss = (sums * cotangent).sum()
+    torch.testing.assert_close((table * to_table).sum(), loss)
+    for slopes, alone in zip((to_x, to_y), sat.edge_slopes(cotangent, table, cells), strict=True):
+        for slope, other in zip(slopes, alone, strict=True):
+            torch.testing.assert_close(slope, other)
+
+    def moved(axis: int, line: int, step: float) -> torch.Tensor:
+        sides = [list(cells.xs), list(cells.ys)]
+        sides[axis][line] = sides[axis][line] + step
+        return (sat.cell_sums(table, Lattice(tuple(sides[0]), tuple(sides[1]), block)) * cotangent).sum((1, 2))
+
+    for axis, slopes in enumerate((to_x, to_y)):
+        for line, slope in enumerate(slopes):
+            numeric = (moved(axis, line, 1e-7) - moved(axis, line, -1e-7)) / 2e-7
+            torch.testing.assert_close(slope, numeric, atol=1e-5, rtol=0)
+    torch.testing.assert_close((image * sat.summed_area_table_adjoint(to_table)).sum(), loss)
 
 
-def test_window_is_clipped_and_survives_infinite_sizes() -> None:
-    half = torch.full((1, 2, 3, 4), torch.inf)
-    window = Window.around_pixels(half)
-    assert window.x0.unique().tolist() == [0.0]
-    assert window.x1.unique().tolist() == [4.0]
-    assert window.y1.unique().tolist() == [3.0]
+def test_windows_are_clipped_and_survive_infinite_sizes() -> None:
+    cells = Lattice.around_pixels(torch.full((1, 2, 3, 4), torch.inf), (3, 4), rows=slice(0, 3), quadrants=True)
+    assert [line.unique().tolist() for line in cells.xs] == [[0.0], [0.5, 1.5, 2.5, 3.5], [4.0]]
+    assert cells.ys[2].unique().tolist() == [3.0]
+
+
+def test_blocks_of_rows_cover_all_rows_once() -> None:
+    half = torch.rand(1, 2, 40, 12, generator=torch.Generator().manual_seed(0)) * 5
+    parts = list(sat.row_blocks(slice(0, 40), 12, 2000, half.device))
+    assert len(parts) > 1
+    joined = [Lattice.around_pixels(half[:, :, part], (20, 12), rows=part) for part in parts]  # two stacked images
+    whole = Lattice.around_pixels(half, (20, 12), rows=slice(0, 40))
+    for axis in ("xs", "ys"):
+        pieces = zip(*(getattr(piece, axis) for piece in joined), strict=True)
+        for line, piece in zip(getattr(whole, axis), pieces, strict=True):
+            assert torch.equal(line, torch.cat(piece, 1))
+
+
+def test_moments_are_those_of_the_valid_samples() -> None:
+    generator = torch.Generator().manual_seed(7)
+    samples = torch.rand(1, 6, 8, generator=generator) + 1e4
+    valid = torch.rand(1, 6, 8, generator=generator) > 0.3
+    half = torch.full((1, 2, 6, 8), 1.5)  # 3 x 3 pixels
+    mean, variance = sat.box_moments(samples, valid, Lattice.around_pixels(half, (6, 8), rows=slice(0, 6)))
+    for row in range(6):
+        for column in range(8):
+            window = (0, slice(max(row - 1, 0), row + 2), slice(max(column - 1, 0), column + 2))
+            inside = samples[window][valid[window]].double()
+            assert abs(float(mean[0, 0, row, column] - inside.mean())) < 1e-9
+            assert abs(float(variance[0, 0, row, column] - inside.var(correction=0))) < 1e-9
 
 
 @pytest.mark.parametrize("offset", [0.0, 10.0, 1e4])
-def test_float32_depth_with_offset_keeps_its_box_means(offset: float) -> None:
-    depth = (torch.rand(1, 512, 512, 1, generator=torch.Generator().manual_seed(0)) + offset).float()
-    half = torch.full((1, 2, 512, 512), 8.5)
-    window = Window.around_pixels(half)
-    means = sat.box_sum(sat.summed_area_table(depth), window)[..., 0] / 17**2
-    # The direct sum of the window, with the offset removed first: nothing to lose.
-    residual = (depth.double() - offset)[0, :, :, 0]
-    direct = torch.nn.functional.avg_pool2d(residual[None], 17, stride=1)[0] + offset
-    inside = means.view(512, 512)[8:-8, 8:-8]
-    assert (inside - direct).abs().max() < 1e-6 + 1e-7 * offset
+def test_variance_is_never_negative(offset: float) -> None:
+    generator = torch.Generator().manual_seed(3)
+    samples = (torch.randint(0, 2, (1, 256, 256), generator=generator) * 1e-3 + offset).float()
+    valid = torch.rand(1, 256, 256, generator=generator) > 0.1
+    for half in (0.3, 2.0, 300.0):
+        windows = Lattice.around_pixels(torch.full((1, 2, 256, 256), half), (256, 256), rows=slice(0, 256), quadrants=True)
+        _, variance = sat.box_moments(samples, valid, windows)
+        assert bool((variance >= 0).all())
+        assert float(variance.max()) > 1e-7

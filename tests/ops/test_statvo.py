@@ -14,14 +14,16 @@ VALUES = {"radius": 0.45, "height": 0.6, "falloff": 0.7, "contrast": 1.4}
 PARAMETERS = tuple(VALUES)
 
 
-def module(layers: int, **changes: float) -> ts.StatVO:
-    net = ts.StatVO(layers=layers, learnable="all").double()
+def module(layers: int, *, variant: dict | None = None, **changes: float) -> ts.StatVO:
+    net = ts.StatVO(layers=layers, learnable="all", **(variant or {})).double()
     for name, value in (VALUES | changes).items():
         setattr(net, name, value)  # set in float64, after the conversion
     return net
 
 
-def oracle(gb: ts.GBuffer, layers: int, eps: float, **changes: float) -> torch.Tensor:
+def oracle(
+    gb: ts.GBuffer, layers: int, eps: float, *, variant: dict | None = None, **changes: float
+) -> torch.Tensor:
     v = VALUES | changes
     camera = gb.camera
     arrays = [t.double().numpy() for t in (camera.fx, camera.fy, camera.cx, camera.cy)]
@@ -38,6 +40,7 @@ def oracle(gb: ts.GBuffer, layers: int, eps: float, **changes: float) -> torch.T
         contrast=v["contrast"],
         layers=layers,
         eps=eps,
+        **({"quadrants": True} | (variant or {})),
     )
     return torch.from_numpy(image)[:, None]
 
@@ -54,12 +57,31 @@ CASES = [
 ]
 
 
+VARIANTS = [
+    {"quadrants": False},
+    {"quadrants": True},
+    {"quadrants": True, "sat_scale": 2},
+    {"quadrants": False, "sat_scale": 4},
+    {"quadrants": False, "layering": "uniform"},
+    {"quadrants": True, "layering": "uniform", "sat_scale": 2},
+]
+
+
 @pytest.mark.parametrize("layers", [1, 2, 4, 8])
 @pytest.mark.parametrize("case", CASES, ids=str)
-def test_float64_equals_the_oracle(case: dict, layers: int) -> None:
+@pytest.mark.parametrize("variant", VARIANTS, ids=str)
+def test_float64_equals_the_oracle(variant: dict, case: dict, layers: int) -> None:
     gb = random_gbuffer(layers, **case)
-    expected = oracle(gb, layers, torch.finfo(torch.float64).eps)
-    torch.testing.assert_close(module(layers)(gb), expected, atol=1e-9, rtol=0)
+    expected = oracle(gb, layers, torch.finfo(torch.float64).eps, variant=variant)
+    torch.testing.assert_close(module(layers, variant=variant)(gb), expected, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("layers", [3, 5, 64])
+def test_uniform_layers_may_be_any_number(layers: int) -> None:
+    gb = random_gbuffer(layers, height=9, width=10)
+    variant = {"layering": "uniform"}
+    expected = oracle(gb, layers, torch.finfo(torch.float64).eps, variant=variant)
+    torch.testing.assert_close(module(layers, variant=variant)(gb), expected, atol=1e-9, rtol=0)
 
 
 @pytest.mark.parametrize("radius", [1e-3, 0.05, 2.0, 100.0])

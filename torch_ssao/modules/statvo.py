@@ -23,8 +23,14 @@ class StatVO(AmbientVisibility):
         height: height of the box over the surface, of the radius, > 0.
         falloff: slope of psi above the box: how fast layers in front of it stop to occlude, > 0.
         contrast: exponent of the visibility, > 0.
-        layers: adaptive depth layers, 1, 2, 4, ... 256. One without depth discontinuities; more remove halos.
-        layering: "adaptive".
+        layers: depth layers, 1 to 256; a power of two when adaptive. One without depth discontinuities; more remove halos.
+        layering: "adaptive" splits samples at their local mean depth, again and again; "uniform" cuts the image's depth range
+            into equal slices, many of which are needed.
+        quadrants: evaluate the four quarters of the window on their own and average them.
+        sat_scale: 1, 2 or 4: build partition and tables at full, half or quarter resolution.
+        gradient: "exact" (almost everywhere: layers are constants) or "surrogate" (adaptive: a sample moves between layers
+            like sigmoid((mean - depth) / width)); the image is the same.
+        surrogate_width: width of that sigmoid, of the box height, > 0.
         learnable: names of the parameters to register as `nn.Parameter`s, or "all"; the rest are buffers.
     Raises:
         RangeError, ChoiceError.
@@ -37,7 +43,7 @@ class StatVO(AmbientVisibility):
         "falloff": ParameterSpec("1", 1e-2, 1e2, "slope of psi above the box"),
         "contrast": ParameterSpec("1", 1e-2, 1e2, "exponent of the visibility"),
     }
-    CHOICES = ("layers", "layering")
+    CHOICES = ("layers", "layering", "quadrants", "sat_scale", "gradient", "surrogate_width")
 
     radius = Positive()
     height = Positive()
@@ -45,6 +51,10 @@ class StatVO(AmbientVisibility):
 
     layers: int
     layering: str
+    quadrants: bool
+    sat_scale: int
+    gradient: str
+    surrogate_width: float
 
     def __init__(
         self,
@@ -55,15 +65,31 @@ class StatVO(AmbientVisibility):
         contrast: float = 1.0,
         layers: int = 4,
         layering: str = "adaptive",
+        quadrants: bool = True,
+        sat_scale: int = 1,
+        gradient: str = "exact",
+        surrogate_width: float = 0.25,
         learnable: str | tuple[str, ...] = (),
     ) -> None:
+        checks.check_choice("layering", layering, ("adaptive", "uniform"))
         checks.check_count("layers", layers, 1, 256)
-        if layers & (layers - 1):
+        if layering == "adaptive" and layers & (layers - 1):
             below = 1 << (layers.bit_length() - 1)
             raise checks.RangeError(f"layers must be a power of two, got {layers}: use {below} or {2 * below}")
-        checks.check_choice("layering", layering, ("adaptive",))
+        checks.check_choice("quadrants", quadrants, (False, True))
+        checks.check_choice("sat_scale", sat_scale, (1, 2, 4))
+        checks.check_choice("gradient", gradient, ("exact",) if layering == "uniform" else ("exact", "surrogate"))
+        checks.check_positive("surrogate_width", surrogate_width)
         values = {"radius": radius, "height": height, "falloff": falloff, "contrast": contrast}
-        super().__init__(values, {"layers": layers, "layering": layering}, learnable)
+        choices = {
+            "layers": layers,
+            "layering": layering,
+            "quadrants": quadrants,
+            "sat_scale": sat_scale,
+            "gradient": gradient,
+            "surrogate_width": surrogate_width,
+        }
+        super().__init__(values, choices, learnable)
 
     def used_parameters(self) -> tuple[str, ...]:
         return tuple(self.PARAMETERS)
@@ -83,6 +109,6 @@ class StatVO(AmbientVisibility):
             camera.footprint(radius, depth),
             (radius * height).expand(batch),
             falloff.expand(batch),
-            layers=self.layers,
+            **self.config(),
         )
         return 1 - obscurance

@@ -4,7 +4,9 @@ from torch_ssao.ops.falloff import contrast_power as contrast_power
 from torch_ssao.ops.falloff import psi as psi
 from torch_ssao.ops.normals import normals_from_points as normals_from_points
 from torch_ssao.ops.partition import adaptive_labels as adaptive_labels
-from torch_ssao.ops.sat import Window as Window
-from torch_ssao.ops.sat import box_sum as box_sum
+from torch_ssao.ops.partition import uniform_labels as uniform_labels
+from torch_ssao.ops.sat import Lattice as Lattice
+from torch_ssao.ops.sat import box_moments as box_moments
+from torch_ssao.ops.sat import cell_sums as cell_sums
 from torch_ssao.ops.sat import summed_area_table as summed_area_table
 from torch_ssao.ops.statvo import statvo_obscurance as statvo_obscurance

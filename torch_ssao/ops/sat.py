@@ -1,188 +1,255 @@
-"""Summed-area tables with exact integrals over fractional windows, and their derivatives.
+"""Summed-area tables and the exact integrals over the cells of a fractional lattice, with their derivatives.
 
 Tables are float64 whatever the input: a float32 table loses the small differences that a box mean is made of
-(docs/statvo.md). Channels come last, so that one lookup reads one short run of memory.
+(docs/statvo.md, "Rounding"). A bilinear lookup at a fractional corner is the exact integral of the piecewise-constant image,
+and torch's own `grid_sample` is that lookup.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
+
+BLOCK_BYTES = {"cpu": 1 << 21, "cuda": 1 << 28}  # of looked-up values at a time: what a core's cache, a GPU's memory holds
+SCATTER_BLOCKS = 16  # an image is scattered in at most so many blocks of rows: each needs a zeroed band of the table
+SCATTER_MIN = 1 << 15  # queries a scatter block has at least
 
 
 @dataclass(frozen=True)
-class Window:
-    """Axis-aligned windows in pixels, one per query, clipped to the image.
+class Lattice:
+    """Vertical lines x_0 <= x_1 <= ... and horizontal lines y_0 <= y_1 <= ... of every query, whose cells are the boxes to sum.
 
     Args:
-        x0, x1, y0, y1: (B, N) float64 edges, 0 <= x0 <= x1 <= W and 0 <= y0 <= y1 <= H; pixel j covers [j, j + 1].
-        height, width: image size.
+        xs, ys: two (one box) or three (quadrants) tensors each, (B, R, S) float64, in pixels; pixel j covers [j, j + 1].
+        block: pixels that one entry of the table spans on each axis (approximate tables); 1 otherwise.
     """
 
-    x0: Tensor
-    x1: Tensor
-    y0: Tensor
-    y1: Tensor
-    height: int
-    width: int
+    xs: tuple[Tensor, ...]
+    ys: tuple[Tensor, ...]
+    block: int = 1
 
     @staticmethod
-    def around_pixels(half: Tensor) -> Window:
-        """Windows centred on the pixels of an image.
+    def around_pixels(
+        half: Tensor, size: tuple[int, int], *, rows: slice, block: int = 1, coarse: bool = False, quadrants: bool = False
+    ) -> Lattice:
+        """Windows centred on pixels, clipped to the image.
 
         Args:
-            half: (B, 2, H, W) half-size in pixels (x, then y), >= 0, may be infinite.
-        Returns: a Window of N = H * W queries in row order.
+            half: (B, 2, R, S) half-size in pixels (x, then y) of the queries in `rows`, >= 0, may be infinite.
+            size: (H, W) of the image in pixels.
+            rows: which rows of queries these are; several images stacked on each other start over at row 0.
+            block: pixels per table entry.
+            coarse: the queries are the table's own entries rather than pixels.
+            quadrants: add the lines through the centre.
         """
-        _, _, height, width = half.shape
-        half = half.double()
-        u = torch.arange(width, device=half.device, dtype=torch.float64) + 0.5
-        v = (torch.arange(height, device=half.device, dtype=torch.float64) + 0.5)[:, None]
-        half_x, half_y = half.unbind(1)
-        return Window(
-            (u - half_x).clamp(min=0).flatten(1),
-            (u + half_x).clamp(max=width).flatten(1),
-            (v - half_y).clamp(min=0).flatten(1),
-            (v + half_y).clamp(max=height).flatten(1),
-            height,
-            width,
-        )
+        height, width = size
+        step = block if coarse else 1
+        stacked = -(-height // step)
+        ticks = torch.arange(max(half.shape[3], rows.stop), device=half.device, dtype=torch.float64)
+        u = ((ticks[: half.shape[3]] + 0.5) * step).expand(half.shape[0], half.shape[2], -1)
+        v = ((ticks[rows] % stacked + 0.5) * step)[:, None].expand_as(u)
+        lines = []
+        for centre, reach, end in ((u, half[:, 0].double(), width), (v, half[:, 1].double(), height)):
+            low, high = (centre - reach).clamp(0, end), (centre + reach).clamp(0, end)
+            lines.append((low, centre, high) if quadrants else (low, high))
+        return Lattice(lines[0], lines[1], block)
 
-    def corners(self) -> tuple[tuple[Tensor, Tensor, float], ...]:
-        """(x, y, sign) of the four table lookups whose signed sum is the box sum."""
-        return (self.x1, self.y1, 1.0), (self.x0, self.y1, -1.0), (self.x1, self.y0, -1.0), (self.x0, self.y0, 1.0)
+    def grid(self, height: int, width: int) -> Tensor:
+        """(K, B, R, S, 2) normalised coordinates of all crossings in a table of height + 1 rows and width + 1 columns; x fastest."""
+        x = [line * (2 / (width * self.block)) - 1 for line in self.xs]
+        y = [line * (2 / (height * self.block)) - 1 for line in self.ys]
+        return torch.stack([torch.stack((a, b), -1) for b in y for a in x])
+
+
+def row_blocks(rows: slice, columns: int, values: int, device: torch.device) -> Iterator[slice]:
+    """Blocks of rows of queries such that `values` float64 of each query fit the block budget."""
+    count = max(1, BLOCK_BYTES.get(device.type, 1 << 28) // (8 * values * columns))
+    for start in range(rows.start, rows.stop, count):
+        yield slice(start, min(start + count, rows.stop))
+
+
+def scatter_blocks(rows: int, columns: int) -> Iterator[slice]:
+    """Blocks of rows for `cell_sums_pull_back`: few, because each zeroes a band of the table."""
+    count = max(-(-rows // SCATTER_BLOCKS), -(-SCATTER_MIN // columns))
+    for start in range(0, rows, count):
+        yield slice(start, min(start + count, rows))
+
+
+def empty_table(samples: Tensor) -> Tensor:
+    """(B, C, H + 1, W + 1) float64 zeros; write samples into `[..., 1:, 1:]`, then call `accumulate`.
+
+    Args:
+        samples: any tensor whose first and last two dimensions are (B, C, ..., H, W).
+    """
+    return samples.new_zeros((*samples.shape[:2], samples.shape[-2] + 1, samples.shape[-1] + 1), dtype=torch.float64)
+
+
+def accumulate(table: Tensor) -> Tensor:
+    """Turn samples at `[..., 1:, 1:]` into their table, in place."""
+    return table.cumsum_(3).cumsum_(2)
 
 
 def summed_area_table(samples: Tensor) -> Tensor:
     """Summed-area table with a zero border.
 
     Args:
-        samples: (B, H, W, C), any floating dtype.
-    Returns: (B, H + 1, W + 1, C) float64; entry (i, j) is the sum over rows < i and columns < j.
-    Gradients: plain autograd, or `summed_area_table_adjoint`.
+        samples: (B, C, H, W), any floating dtype.
+    Returns: (B, C, H + 1, W + 1) float64; entry (i, j) is the sum over rows < i and columns < j.
+    Gradients: `summed_area_table_adjoint`.
     Cost: two passes; 8 C bytes a pixel.
     Source: Crow 1984.
     """
-    padded = torch.nn.functional.pad(samples.double(), (0, 0, 1, 0, 1, 0))
-    return padded.cumsum(2).cumsum(1)
+    table = empty_table(samples)
+    table[:, :, 1:, 1:] = samples
+    return accumulate(table)
 
 
 def summed_area_table_adjoint(grad: Tensor) -> Tensor:
     """Adjoint of `summed_area_table`: cumulative sums from the other end.
 
     Args:
-        grad: (B, H + 1, W + 1, C) cotangent of the table.
-    Returns: (B, H, W, C) cotangent of the samples.
+        grad: (B, C, H + 1, W + 1) float64 cotangent of the table; overwritten.
+    Returns: (B, C, H, W) cotangent of the samples, a view of `grad`.
     """
-    inner = grad[:, 1:, 1:]
-    return inner.flip(1).cumsum(1).flip(1).flip(2).cumsum(2).flip(2)
+    inner = grad[:, :, 1:, 1:]
+    for channel in inner.unbind(1):  # one at a time: flipping copies
+        channel.copy_(channel.flip(1, 2).cumsum_(1).cumsum_(2).flip(1, 2))
+    return inner
 
 
-def box_sum(table: Tensor, window: Window) -> Tensor:
-    """Exact integral of the piecewise-constant image over fractional windows.
+def cell_sums(table: Tensor, lattice: Lattice) -> Tensor:
+    """Exact integrals of the piecewise-constant image over the cells of a lattice.
 
     Args:
-        table: (B, H + 1, W + 1, C) from `summed_area_table`.
-        window: N windows per image.
-    Returns: (B, N, C) float64 sums, weighted by the covered area of each pixel.
-    Gradients: `box_sum_edges` and `box_sum_adjoint` give the derivative to the edges and to the table.
-    Cost: 8 reads of 2 C values a window, whatever its size.
-    Source: the bilinear lookup of a SAT at fractional corners is the exact integral (Leibniz).
+        table: (B, C, h + 1, w + 1) float64 from `summed_area_table`.
+        lattice: of (B, R, S) queries.
+    Returns: (B, Q, C, R, S) float64 with Q = 1 cell or 4 quadrants (left to right, top to bottom), each pixel weighted by its
+        covered area (an approximate table spreads each entry evenly over its block).
+    Gradients: `cell_sums_pull_back`, `edge_slopes`.
+    Cost: 4 C reads a corner, 4 corners or 9, whatever the size of the box.
+    Source: Crow 1984; the paper's Fig. 8 for the quadrants.
     """
-    upper, lower = _edge_rows(table, window, window.y0), _edge_rows(table, window, window.y1)
-    return torch.lerp(lower.first.width, lower.second.width, lower.fraction) - torch.lerp(
-        upper.first.width, upper.second.width, upper.fraction
-    )
+    batch, channels, height, width = table.shape
+    grid = lattice.grid(height - 1, width - 1)
+    corners, _, rows, columns, _ = grid.shape
+    if batch == 1:  # torch's kernel runs images in parallel: make each corner one
+        values = _lookup(table.expand(corners, -1, -1, -1), grid[:, 0])
+        values = values[None]
+    else:
+        values = _lookup(table, grid.transpose(0, 1).flatten(1, 2))
+        values = values.view(batch, channels, corners, rows, columns).transpose(1, 2)
+    return _cells(values, len(lattice.xs), len(lattice.ys))
 
 
-def box_sum_edges(table: Tensor, window: Window) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Derivative of the box sum with respect to the edges x0, x1, y0, y1: (minus) the sum over the strip at each edge.
-
-    Args and Cost as for `box_sum`.
-    Returns: four (B, N, C) tensors.
-    """
-    upper, lower = _edge_rows(table, window, window.y0), _edge_rows(table, window, window.y1)
-    left, right = (
-        torch.lerp(getattr(lower.first, side), getattr(lower.second, side), lower.fraction)
-        - torch.lerp(getattr(upper.first, side), getattr(upper.second, side), upper.fraction)
-        for side in ("left", "right")
-    )
-    return -left, right, upper.first.width - upper.second.width, lower.second.width - lower.first.width
-
-
-def box_sum_adjoint(grad: Tensor, window: Window) -> Tensor:
-    """Adjoint of `box_sum` in the table: scatter the four corners.
+def cell_sums_pull_back(
+    to_sums: Tensor, table: Tensor, lattice: Lattice, to_table: Tensor
+) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Adjoint of `cell_sums` in the table (added to `to_table`) and in the lines.
 
     Args:
-        grad: (B, N, C) cotangent of the sums.
-        window: the windows.
-    Returns: (B, H + 1, W + 1, C) cotangent of the table.
+        to_sums: (B, Q, C, R, S) cotangent.
+        table: (B, C, h + 1, w + 1), C even.
+        lattice: as in `cell_sums`.
+        to_table: accumulated in place, shape of table.
+    Returns: cotangents of `lattice.xs` and of `lattice.ys`, each (B, R, S).
+    Cost: about 5 C additions a corner, plus one zeroed band of the table for each horizontal line.
     """
-    batch, _, channels = grad.shape
-    shape = (batch, window.height + 1, window.width + 1, channels)
-    flat = grad.new_zeros(batch * shape[1] * shape[2], channels)
-    for x, y, sign in window.corners():
-        for index, weight in _taps(x, y, shape):
-            flat = flat.index_add(0, index.flatten(), (grad * (sign * weight)[..., None]).flatten(0, 1))
-    return flat.view(shape)
+    batch, channels, height, width = table.shape
+    to_corners = _corners(to_sums)  # (B, Ky, Kx, C, R, S)
+    to_x = [torch.zeros_like(line) for line in lattice.xs]
+    to_y = [torch.zeros_like(line) for line in lattice.ys]
+    grid_x = torch.stack([line * (2 / ((width - 1) * lattice.block)) - 1 for line in lattice.xs], 1)  # (B, Kx, R, S)
+    for j, line in enumerate(lattice.ys):
+        low, high = _band(line, lattice.block, height)
+        part = table[:, :, low:high]
+        span = (high - low - 1) * lattice.block
+        grid_y = ((line - low * lattice.block) * (2 / span) - 1)[:, None].expand_as(grid_x)
+        grid = torch.stack((grid_x, grid_y), -1).flatten(1, 2)
+        cotangent = to_corners[:, j].transpose(1, 2).flatten(2, 3)  # (B, C, Kx R, S)
+        to_part, to_grid = _lookup_backward(cotangent, part, grid)
+        to_table[:, :, low:high] += to_part
+        to_grid = to_grid.view(*grid_x.shape, 2)
+        to_y[j] += to_grid[..., 1].sum(1) * (2 / span)
+        for i, slope in enumerate(to_grid[..., 0].unbind(1)):
+            to_x[i] += slope * (2 / ((width - 1) * lattice.block))
+    return tuple(to_x), tuple(to_y)
 
 
-def _taps(x: Tensor, y: Tensor, shape: tuple[int, ...] | torch.Size) -> list[tuple[Tensor, Tensor]]:
-    """The four table entries around fractional (x, y) with their bilinear weights."""
-    (column, right), (row, below) = _split(x, shape[2] - 1), _split(y, shape[1] - 1)
-    base = _base(shape, x.device) + row * shape[2] + column
-    left, above = 1 - right, 1 - below
-    return [
-        (base, above * left),
-        (base + 1, above * right),
-        (base + shape[2], below * left),
-        (base + shape[2] + 1, below * right),
-    ]
+def edge_slopes(to_sums: Tensor, table: Tensor, lattice: Lattice) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """The cotangents of the lines alone, as `cell_sums_pull_back` gives them: for forward mode, where to_sums is contracted."""
+    _, _, height, width = table.shape
+    grid = lattice.grid(height - 1, width - 1)
+    corners, batch, rows, columns, _ = grid.shape
+    cotangent = _corners(to_sums).permute(0, 3, 1, 2, 4, 5).flatten(2, 4)
+    _, to_grid = _lookup_backward(cotangent, table, grid.transpose(0, 1).flatten(1, 2), to_input=False)
+    to_grid = to_grid.view(batch, len(lattice.ys), len(lattice.xs), rows, columns, 2)
+    along_x, along_y = to_grid[..., 0].sum(1), to_grid[..., 1].sum(2)
+    scale_x, scale_y = 2 / ((width - 1) * lattice.block), 2 / ((height - 1) * lattice.block)
+    return tuple((along_x * scale_x).unbind(1)), tuple((along_y * scale_y).unbind(1))
 
 
-class _Row(NamedTuple):
-    """One table row at the two vertical edges of every window: all (B, N, C)."""
+def box_moments(samples: Tensor, valid: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
+    """Mean and variance of the valid samples inside each cell.
 
-    width: Tensor  # row sum between x0 and x1
-    left: Tensor  # slope of the row at x0
-    right: Tensor  # slope of the row at x1
-
-
-class _EdgeRows(NamedTuple):
-    first: _Row
-    second: _Row
-    fraction: Tensor  # (B, N, 1), where the horizontal edge lies between the two rows
-
-
-def _edge_rows(table: Tensor, window: Window, y: Tensor) -> _EdgeRows:
-    """The two table rows around a horizontal edge."""
-    batch, height, width, channels = table.shape
-    neighbours = table.reshape(-1).unfold(0, 2 * channels, channels)  # entry and its right neighbour in one read
-    row, fraction = _split(y, height - 1)
-    start = _base(table.shape, table.device) + row * width
-    edges = [_split(x, width - 1) for x in (window.x0, window.x1)]
-
-    def read(start: Tensor) -> _Row:
-        values, slopes = [], []
-        for column, part in edges:
-            pair = neighbours.index_select(0, (start + column).flatten()).view(batch, -1, 2, channels)
-            slope = pair[:, :, 1] - pair[:, :, 0]
-            values.append(torch.addcmul(pair[:, :, 0], slope, part[..., None]))
-            slopes.append(slope)
-        return _Row(values[1] - values[0], *slopes)
-
-    return _EdgeRows(read(start), read(start + width), fraction[..., None])
+    Args:
+        samples: (B, H, W), finite everywhere; valid: (B, H, W) bool.
+        lattice: of (B, R, S) queries.
+    Returns: mean and variance, (B, Q, R, S) float64, 0 where a cell holds no sample. The variance is taken about the image's
+        mean, which costs it nothing on a large offset, and is never negative.
+    Cost: one table of 4 channels.
+    """
+    count = valid.double().sum((1, 2), keepdim=True).clamp(min=1)
+    centre = torch.where(valid, samples.double(), 0.0).sum((1, 2), keepdim=True) / count
+    moved = torch.where(valid, samples.double() - centre, 0.0)
+    table = summed_area_table(torch.stack((moved, moved.square(), valid.double(), valid.double()), 1))
+    first, second, area, _ = cell_sums(table, lattice).unbind(2)
+    held = area > 0
+    area = area.clamp(min=1e-12)
+    mean = torch.where(held, first / area, 0.0)
+    variance = torch.where(held, second / area - mean.square(), 0.0).clamp(min=0)
+    return torch.where(held, mean + centre[:, None], 0.0), variance
 
 
-def _split(position: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Cell index in [0, size - 1] and the fraction inside it."""
-    cell = position.floor().clamp(max=size - 1)
-    return cell.long(), position - cell
+def _lookup(table: Tensor, grid: Tensor) -> Tensor:
+    return grid_sample(table, grid, mode="bilinear", padding_mode="border", align_corners=True)
 
 
-def _base(shape: tuple[int, ...] | torch.Size, device: torch.device) -> Tensor:
-    """First row of each image in the flattened table, (B, 1)."""
-    return (torch.arange(shape[0], device=device) * (shape[1] * shape[2]))[:, None]
+def _lookup_backward(grad: Tensor, table: Tensor, grid: Tensor, *, to_input: bool = True) -> tuple[Tensor, Tensor]:
+    """Adjoint of `_lookup`; on one image two halves of the channels run in parallel."""
+    batch, channels = table.shape[:2]
+    if batch == 1:
+        table, grad = table.reshape(2, channels // 2, *table.shape[2:]), grad.reshape(2, channels // 2, *grad.shape[2:])
+        grid = grid.expand(2, -1, -1, -1)
+    to_table, to_grid = torch.ops.aten.grid_sampler_2d_backward(grad, table, grid, 0, 1, True, [to_input, True])
+    if batch == 1:
+        to_table = to_table.flatten(0, 1)[None] if to_input else to_table
+        to_grid = to_grid.sum(0, keepdim=True)
+    return to_table, to_grid
+
+
+def _cells(values: Tensor, columns: int, rows: int) -> Tensor:
+    """(B, K, C, R, S) table values at the crossings -> (B, Q, C, R, S) cell sums."""
+    values = values.unflatten(1, (rows, columns))
+    return values.diff(dim=1).diff(dim=2).flatten(1, 2)
+
+
+def _corners(to_sums: Tensor) -> Tensor:
+    """Adjoint of `_cells`: (B, Q, C, R, S) -> (B, Ky, Kx, C, R, S)."""
+    side = 2 if to_sums.shape[1] == 4 else 1
+    cells = to_sums.unflatten(1, (side, side))
+    for dim in (1, 2):
+        edge = torch.zeros_like(cells.narrow(dim, 0, 1))
+        cells = torch.cat((edge, cells), dim) - torch.cat((cells, edge), dim)
+    return cells
+
+
+def _band(line: Tensor, block: int, height: int) -> tuple[int, int]:
+    """Rows of the table that the lookups of one horizontal line touch; all of them where asking would stall a GPU."""
+    if line.is_cuda:
+        return 0, height
+    low, high = (int(value) // block for value in torch.aminmax(line))
+    return max(min(low, height - 2), 0), min(high + 2, height)

@@ -1,0 +1,263 @@
+"""StatVO on raw tensors: the value and its derivatives, layer by layer and block of rows by block of rows.
+
+No autograd in here. `ops.statvo` wraps these into a differentiable function; what is alive at a time is one table, its cotangent
+and a block of rows, so that memory grows neither with the layers nor with the footprint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ssao.ops import sat
+from torch_ssao.ops.falloff import psi
+from torch_ssao.ops.leaf_tables import Leaf, leaf_tables
+from torch_ssao.ops.partition import MIN_COUNT, ROUNDING, Samples, adaptive_labels, uniform_labels
+from torch_ssao.ops.sat import Lattice
+from torch_ssao.ops.soft_partition import SoftPartition, half_from_lines
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The discrete choices; see `ops.statvo.statvo_obscurance`."""
+
+    layers: int
+    layering: str
+    quadrants: bool
+    block: int
+    differential: bool
+    gradient: str
+
+
+class Queries(NamedTuple):
+    """Where the obscurance is asked for: the pixels of the nearest image.
+
+    centre, normal: (B, 3, H, W); seen: (B, H, W) bool; half: (B, 2, H, W); box_height, slope, width: (B,).
+    """
+
+    centre: Tensor
+    normal: Tensor
+    seen: Tensor
+    half: Tensor
+    box_height: Tensor
+    slope: Tensor
+    width: Tensor
+
+
+class Response(NamedTuple):
+    """One layer as the boxes of a block of rows see it: (B, Q, rows, W) float64, vectors (B, Q, 3, rows, W)."""
+
+    amount: Tensor  # pixels of the layer in the box
+    mean: Tensor  # mean position over the centre x
+    height: Tensor  # mean height over the surface as a fraction of the box
+    value: Tensor
+    to_height: Tensor
+    to_slope: Tensor
+
+
+class LayeredObscurance:
+    """What value, pull-back and push-forward share."""
+
+    def __init__(self, samples: Samples, queries: Queries, settings: Settings) -> None:
+        self.samples, self.queries, self.settings = samples, queries, settings
+        self.origin = samples.centre()
+        self.box_height = queries.box_height.double()[:, None, None, None]
+        self.slope = queries.slope.double()[:, None, None, None]
+        self.lost = samples.table_rounding(self.origin)[:, None, None, None]
+        self.eps = ROUNDING * torch.finfo(samples.position.dtype).eps
+        self.cells = 4 if settings.quadrants else 1
+
+    # ---- the value ---------------------------------------------------------------------------------------------
+
+    def value(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Obscurance (B, H, W); labels (B, L, h, w); obscurance and samples of each box, (B, Q, H, W)."""
+        labels = self._labels()
+        batch, height, width = self.queries.seen.shape
+        total = torch.zeros((batch, self.cells, height, width), dtype=torch.float64, device=labels.device)
+        count = torch.zeros_like(total)
+        for leaf in self._leaves(labels):
+            for rows, lattice in self._windows():
+                response = self._respond(sat.cell_sums(leaf.table, lattice), rows)
+                total[:, :, rows] += response.amount * response.value
+                count[:, :, rows] += response.amount
+        dtype = self.samples.position.dtype
+        boxes = torch.where(count > 0, total.div_(count.clamp(min=MIN_COUNT)), 0.0).clamp_(max=1)
+        held = (count > 0).sum(1).clamp(min=1)
+        obscurance = torch.where(self.queries.seen, boxes.sum(1) / held, 0.0)
+        return obscurance.to(dtype), labels, boxes.to(dtype), count.to(dtype)
+
+    def _labels(self) -> Tensor:
+        if self.settings.layering == "uniform":
+            return uniform_labels(self.samples, self.settings.layers)
+        return adaptive_labels(self.samples, self.settings.layers)
+
+    def _leaves(self, labels: Tensor) -> Iterator[Leaf]:
+        return leaf_tables(
+            self.samples, self.origin, labels, self.settings.layers, differential=self.settings.differential
+        )
+
+    def _windows(self, outer: slice | None = None) -> Iterator[tuple[slice, Lattice]]:
+        """Blocks of rows of pixels, all or those inside `outer`, with their windows."""
+        rows, columns = self.queries.seen.shape[1:]
+        values = 4 * (9 if self.settings.quadrants else 4)
+        for part in sat.row_blocks(outer or slice(0, rows), columns, values, self.lost.device):
+            yield part, self._lattice(part)
+
+    def _lattice(self, rows: slice) -> Lattice:
+        return Lattice.around_pixels(
+            self.queries.half[:, :, rows],
+            self.samples.size,
+            rows=rows,
+            block=self.settings.block,
+            quadrants=self.settings.quadrants,
+        )
+
+    def _respond(self, sums: Tensor, rows: slice) -> Response:
+        area = sums[:, :, 3]
+        safe = area.clamp(min=MIN_COUNT)
+        centre = self.queries.centre[:, :, rows].double()
+        normal = self.queries.normal[:, :, rows].double()
+        relative = (self.origin[..., None, None] - centre)[:, None]
+        mean = sums[:, :, :3] / safe[:, :, None] + relative
+        rise = (mean * normal[:, None]).sum(2)
+        reach = torch.linalg.vector_norm(centre, dim=1)[:, None]
+        height = torch.where(rise > self.eps * reach + self.lost / safe, rise / self.box_height, 0.0)
+        amount = torch.where(area >= MIN_COUNT, area, 0.0)
+        return Response(amount, mean, height, *psi(height, self.slope))
+
+    # ---- derivatives -------------------------------------------------------------------------------------------
+
+    def _derivatives(self, response: Response, boxes: Tensor, count: Tensor, rows: slice) -> tuple[Tensor, Tensor, Tensor]:
+        """d VO / d (sums of this layer) (B, Q, 4, rows, W), d VO / d rise and d VO / d slope (B, Q, rows, W)."""
+        boxes, count = boxes[:, :, rows].double(), count[:, :, rows].double()
+        held = (count > 0).sum(1, keepdim=True).clamp(min=1)
+        weight = torch.where(self.queries.seen[:, None, rows] & (response.amount > 0), 1 / held, 0.0)
+        weight = weight / count.clamp(min=MIN_COUNT)
+        per_rise = weight * response.to_height / self.box_height
+        normal = self.queries.normal[:, :, rows].double()
+        centre = self.queries.centre[:, :, rows].double() - self.origin[..., None, None]
+        over_origin = ((response.mean + centre[:, None]) * normal[:, None]).sum(2)
+        to_count = weight * (response.value - boxes) - per_rise * over_origin
+        to_sums = torch.cat((per_rise[:, :, None] * normal[:, None], to_count[:, :, None]), 2)
+        return to_sums, per_rise * response.amount, weight * response.amount * response.to_slope
+
+    def pull_back(self, grad: Tensor, labels: Tensor, boxes: Tensor, count: Tensor) -> list[Tensor]:
+        """Cotangents of position, sample half, centre, normal, half, box_height and slope.
+
+        Args:
+            grad: (B, H, W) cotangent of the obscurance; the rest as `value` returned them.
+        """
+        samples, queries = self.samples, self.queries
+        soft = SoftPartition(samples, self.settings.layers, queries.width) if self._is_soft() else None
+        decisions = soft.zeros() if soft else None
+        to_position = samples.position.new_zeros(samples.position.shape)
+        to_normal, to_half = (torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (queries.normal, queries.half))
+        to_rise_sum = torch.zeros_like(grad, dtype=torch.float64)
+        to_box, to_slope = (torch.zeros_like(t, dtype=torch.float64) for t in (queries.box_height, queries.slope))
+        for leaf in self._leaves(labels):
+            to_table = torch.zeros_like(leaf.table)
+            for outer in sat.scatter_blocks(*grad.shape[1:]):
+                to_sums = []
+                for rows, lattice in self._windows(outer):
+                    response = self._respond(sat.cell_sums(leaf.table, lattice), rows)
+                    sums, rise, slope = self._derivatives(response, boxes, count, rows)
+                    weight = grad[:, None, rows].double()
+                    to_sums.append(sums * weight[:, :, None])
+                    rise = rise * weight
+                    to_rise_sum[:, rows] += rise.sum(1)
+                    to_normal[:, :, rows] += (rise[:, :, None] * response.mean).sum(1)
+                    to_box -= (rise * response.height).flatten(1).sum(1)
+                    to_slope += (slope * weight).flatten(1).sum(1)
+                lattice = self._lattice(outer)
+                lines = sat.cell_sums_pull_back(torch.cat(to_sums, 3), leaf.table, lattice, to_table)
+                to_half[:, :, outer] += half_from_lines(*lines, lattice, samples.size)
+            to_samples = sat.summed_area_table_adjoint(to_table)
+            for axis in range(3):
+                moved = to_samples[:, axis, None] * samples.mass
+                to_position[:, axis] = torch.where(leaf.member, moved.to(to_position.dtype), to_position[:, axis])
+            if soft:
+                soft.add_membership_cotangent(decisions, self._to_member(to_samples), soft.rounds, leaf.label)
+        to_sample_half = samples.half.new_zeros((grad.shape[0], 0))
+        if soft:
+            to_depth, to_sample_half = soft.pull_back(decisions)
+            to_position[:, 2] += to_depth.to(to_position.dtype)
+        to_centre = (-to_rise_sum[:, None] * queries.normal).to(to_position.dtype)
+        return [to_position, to_sample_half, to_centre, to_normal, to_half, to_box.to(grad.dtype), to_slope.to(grad.dtype)]
+
+    def push_forward(self, tangents: dict[str, Tensor | None], labels: Tensor, boxes: Tensor, count: Tensor) -> Tensor:
+        """Tangent of the obscurance, (B, H, W).
+
+        Args:
+            tangents: by name - position, sample_half, centre, normal, half, box_height, slope; None costs nothing.
+        """
+        samples, queries = self.samples, self.queries
+        position, half = tangents["position"], tangents["half"]
+        soft = SoftPartition(samples, self.settings.layers, queries.width) if self._is_soft() else None
+        decisions = soft.push_forward(None if position is None else position[:, 2], tangents["sample_half"]) if soft else None
+        total = torch.zeros_like(queries.seen, dtype=torch.float64)
+        for leaf in self._leaves(labels):
+            moving = self._moving_table(leaf, position, soft, decisions)
+            for rows, lattice in self._windows():
+                response = self._respond(sat.cell_sums(leaf.table, lattice), rows)
+                to_sums, to_rise, to_slope = self._derivatives(response, boxes, count, rows)
+                tangent = self._own_tangent(tangents, response, to_rise, to_slope, rows)
+                if moving is not None:
+                    tangent = tangent + (sat.cell_sums(moving, lattice) * to_sums).sum((1, 2))
+                if half is not None:
+                    slopes = half_from_lines(*sat.edge_slopes(to_sums, leaf.table, lattice), lattice, samples.size)
+                    tangent = tangent + (slopes * half[:, :, rows]).sum(1)
+                total[:, rows] += tangent
+        return total.to(samples.position.dtype)
+
+    def _own_tangent(
+        self, tangents: dict[str, Tensor | None], response: Response, to_rise: Tensor, to_slope: Tensor, rows: slice
+    ) -> Tensor:
+        """What the pixel's own centre, normal, box and slope add."""
+        normal = self.queries.normal[:, :, rows].double()
+        tangent = torch.zeros_like(to_rise[:, 0])
+        if (centre := tangents["centre"]) is not None:
+            tangent = tangent - to_rise.sum(1) * (centre[:, :, rows] * normal).sum(1)
+        if (turned := tangents["normal"]) is not None:
+            tangent = tangent + (to_rise * (turned[:, None, :, rows] * response.mean).sum(2)).sum(1)
+        if (box_height := tangents["box_height"]) is not None:
+            tangent = tangent - (to_rise * response.height).sum(1) * box_height[:, None, None]
+        if (slope := tangents["slope"]) is not None:
+            tangent = tangent + to_slope.sum(1) * slope[:, None, None]
+        return tangent
+
+    def _moving_table(
+        self, leaf: Leaf, position: Tensor | None, soft: SoftPartition | None, decisions: list[Tensor] | None
+    ) -> Tensor | None:
+        """Table of the tangents of a layer's samples; None when nothing moves."""
+        if position is None and decisions is None:
+            return None
+        mass = self.samples.mass.double()
+        joined = None if soft is None else mass * soft.membership_tangent(decisions, soft.rounds, leaf.label)
+        channels = []
+        for axis in range(3):
+            moved = torch.zeros_like(mass)
+            if position is not None:
+                moved += torch.where(leaf.member, position[:, axis] * mass, 0.0)
+            if joined is not None:
+                moved += joined * self._apart(axis)
+            channels.append(moved.sum(1))
+        channels.append(channels[0] * 0 if joined is None else joined.sum(1))
+        return sat.summed_area_table(torch.stack(channels, 1))
+
+    def _to_member(self, to_samples: Tensor) -> Tensor:
+        """(B, L, h, w) cotangent of a layer's memberships."""
+        total = to_samples[:, 3, None].expand(self.samples.mass.shape).clone()
+        for axis in range(3):
+            total += to_samples[:, axis, None] * self._apart(axis)
+        return torch.where(self.samples.mass > 0, total * self.samples.mass, 0.0)
+
+    def _apart(self, axis: int) -> Tensor:
+        return self.samples.position[:, axis].double() - self.origin[:, axis, None, None, None]
+
+    def _is_soft(self) -> bool:
+        return self.settings.gradient == "surrogate" and self.settings.layers > 1
+
