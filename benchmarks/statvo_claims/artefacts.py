@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,9 @@ from torch import Tensor
 
 import torch_ssao as ts
 from benchmarks.statvo_claims import stages
-from benchmarks.statvo_claims.common import Candidate, builtin_case, case, fitted, visibility
+from benchmarks.statvo_claims.common import Candidate, Run, builtin_case, case, fitted, visibility
 from benchmarks.statvo_claims.obscurance import point_sampled
-from benchmarks.statvo_claims.pictures import curve_axes, strip
+from benchmarks.statvo_claims.pictures import curves, strip
 
 HEIGHT = 240
 FIT_HEIGHT = 120  # parameters are in scene units: they hold at any resolution
@@ -30,7 +29,7 @@ AZIMUTHS = (0.0, 2.0, 5.0, 10.0, 20.0, 45.0, 90.0)
 BORDERS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of the footprint
 
 
-def halos(figures: Path) -> tuple[list[dict[str, Any]], str]:
+def halos(run: Run) -> tuple[list[dict[str, Any]], str]:
     """Darkness on a wall beside a pillar far in front of it, where the truth is 1."""
     rows, pictures = [], []
     for name, turn in TURNS:
@@ -54,7 +53,9 @@ def halos(figures: Path) -> tuple[list[dict[str, Any]], str]:
     cut = [(caption, image[..., *middle]) for caption, image in pictures]
     title = f"wall 4 R behind a pillar: worst and mean darkness of the wall within {BAND} px of the pillar (truth 0)"
     half = len(cut) // 2
-    strip(figures / "statvo_halos.png", [cut[:half], cut[half:]], names=[n for n, _ in TURNS], title=title, size=1.75)
+    strip(
+        run.figures / "statvo_halos.png", [cut[:half], cut[half:]], names=[n for n, _ in TURNS], title=title, size=1.75
+    )
     return rows, _halo_statement(rows)
 
 
@@ -75,7 +76,7 @@ def _halo_statement(rows: list[dict[str, Any]]) -> str:
     return "; ".join(words)
 
 
-def pillars(figures: Path) -> tuple[list[dict[str, Any]], str]:
+def pillars(run: Run) -> tuple[list[dict[str, Any]], str]:
     """Looking along a row of pillars: more discontinuities in a window than layers."""
     where, small = (case(stages.row_of_pillars(), 0, height, samples=1024) for height in (HEIGHT, FIT_HEIGHT))
     shared, _ = fitted(Candidate(16), small)
@@ -97,7 +98,7 @@ def pillars(figures: Path) -> tuple[list[dict[str, Any]], str]:
     zoom = slice(50, 210), slice(90, 250)
     cut = [(caption, image[..., *zoom]) for caption, image in line]
     title = "along a row of pillars: RMSE against point-sampled obscurance / against rays; one set of parameters"
-    strip(figures / "statvo_pillars.png", [cut[:4], cut[4:]], title=title)
+    strip(run.figures / "statvo_pillars.png", [cut[:4], cut[4:]], title=title)
     rows.append({"layers": None, "rmse_vo": 0.0, "rmse_rays": where.error(obscurance)})
     words = [
         f"{r['layers']} layers: {r['rmse_vo']:.4f} from point-sampled obscurance, {r['rmse_rays']:.4f} from rays "
@@ -107,7 +108,7 @@ def pillars(figures: Path) -> tuple[list[dict[str, Any]], str]:
     return rows, "; ".join([*words, f"point-sampled obscurance itself: {rows[-1]['rmse_rays']:.4f} from rays"])
 
 
-def thin(figures: Path) -> tuple[list[dict[str, Any]], str]:
+def thin(run: Run) -> tuple[list[dict[str, Any]], str]:
     """A thin plate on a floor, from edge-on to the side: occlusion of the floor beside it, as a share of the true one."""
     scene = stages.plate(AZIMUTHS)
     size = {"height": HEIGHT, "width": HEIGHT * 4 // 3}
@@ -125,7 +126,6 @@ def thin(figures: Path) -> tuple[list[dict[str, Any]], str]:
         beside = _beside_plate(ts.scenes.primary_hits(scene, view, **size))
         true = float((1 - where.truth.visibility)[beside].mean())
         images = [(name, visibility(module, where.gbuffer)) for name, module in modules.items()]
-        images.append(("point-sampled", point_sampled(where.gbuffer, **modules["4 layers"].values())))
         strips[azimuth] = [*images, ("ray-traced", where.truth.visibility)]
         for name, image in images:
             found = float((1 - image)[beside].mean())
@@ -134,12 +134,11 @@ def thin(figures: Path) -> tuple[list[dict[str, Any]], str]:
     middle = slice(40, 210), slice(60, 260)
     cut = [[(caption, image[..., *middle]) for caption, image in strips[a]] for a in (AZIMUTHS[0], AZIMUTHS[-1])]
     title = "thin plate on a floor; parameters fitted to the floor beside it, seen from the side"
-    strip(figures / "statvo_thin.png", cut, names=("edge-on", "from the side"), title=title)
-    names = [*candidates, "point-sampled"]
-    lines = {n: ([r["azimuth_deg"] for r in rows if r["candidate"] == n], _shares(rows, n)) for n in names}
+    strip(run.figures / "statvo_thin.png", cut, names=("edge-on", "from the side"), title=title)
+    lines = {n: (list(AZIMUTHS), _shares(rows, n)) for n in candidates}
     x, y = "degrees from edge-on", "occlusion of the floor / true"
-    curve_axes(figures / "statvo_thin_angle.png", lines, x=x, y=y, title="floor within R of a plate of 2 cm")
-    words = [f"{n}: {_shares(rows, n)[0]:.2f} edge-on, {_shares(rows, n)[-1]:.2f} from the side" for n in names]
+    curves(run.figures / "statvo_thin_angle.png", {"floor within R of a plate of 2 cm": lines}, x=x, y=y)
+    words = [f"{n}: {_shares(rows, n)[0]:.2f} edge-on, {_shares(rows, n)[-1]:.2f} from the side" for n in candidates]
     return rows, "occlusion of the floor within R of the plate, of the true one: " + "; ".join(words)
 
 
@@ -156,7 +155,7 @@ def _beside_plate(hits: ts.scenes.PrimaryHits) -> Tensor:
     return torch.from_numpy(on_floor & (np.hypot(across, along) < stages.RADIUS))[None, None]
 
 
-def guard_band(figures: Path) -> tuple[list[dict[str, Any]], str]:
+def guard_band(run: Run) -> tuple[list[dict[str, Any]], str]:
     """Pixels whose window is cut by the image border, rendered with and without a border that is cropped afterwards."""
     rows, words = [], []
     lines: dict[str, tuple[list[float], list[float]]] = {}
@@ -185,7 +184,7 @@ def guard_band(figures: Path) -> tuple[list[dict[str, Any]], str]:
         )
         print(words[-1], flush=True)
     x, y = "border / footprint", "RMSE against a border of 4 footprints"
-    curve_axes(figures / "statvo_guard_band.png", lines, x=x, y=y, title="pixels whose window the image border cuts")
+    curves(run.figures / "statvo_guard_band.png", {"pixels whose window the image border cuts": lines}, x=x, y=y)
     return rows, "; ".join(words)
 
 

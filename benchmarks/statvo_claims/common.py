@@ -24,6 +24,25 @@ EVALUATIONS = 60
 
 
 @dataclass(frozen=True)
+class Run:
+    """What a run of a claim is asked for; `layers` keeps the rows of the scenes that it is not asked for.
+
+    Args:
+        figures: folder of the pictures.
+        scenes: built-in scenes to measure.
+        known: rows of other scenes from an earlier run.
+    """
+
+    figures: Path
+    scenes: tuple[str, ...]
+    known: list[dict[str, Any]]
+
+    def joined(self, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Known and new rows in the order of the built-in scenes."""
+        return sorted(self.known + rows, key=lambda row: ts.scenes.names().index(row["scene"]))
+
+
+@dataclass(frozen=True)
 class Candidate:
     """A configuration of StatVO."""
 
@@ -128,6 +147,12 @@ def medians_ms(works: Sequence[Callable[[], Any]], repeats: int) -> list[dict[st
         low, median, high = statistics.quantiles(record, n=4)
         result.append({"median_ms": median, "q1_ms": low, "q3_ms": high, "repeats": repeats})
     return result
+
+
+def stored(path: Path, claim: str, scenes: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Rows of a claim in the results file that belong to none of these scenes."""
+    known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return [row for row in known.get(claim, {}).get("rows", []) if row.get("scene") not in scenes]
 
 
 def store(path: Path, claim: str, rows: list[dict[str, Any]], statement: str) -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import torch_ssao as ts
 from benchmarks.statvo_claims.common import (
     Candidate,
     Case,
+    Run,
     builtin_case,
     fitted,
     median_footprint,
@@ -16,7 +16,7 @@ from benchmarks.statvo_claims.common import (
     visibility,
 )
 from benchmarks.statvo_claims.obscurance import point_sampled
-from benchmarks.statvo_claims.pictures import curve_axes, strip
+from benchmarks.statvo_claims.pictures import curves, strip
 
 FIT_HEIGHT = 120
 TIME_HEIGHT = 240
@@ -25,18 +25,17 @@ DEMANDED = ("temple", "street")
 ADAPTIVE = tuple(Candidate(n) for n in (1, 2, 4, 8))
 UNIFORM = tuple(Candidate(n, "uniform") for n in (4, 16, 64))
 QUADRANTS = (Candidate(4, quadrants=True), Candidate(64, "uniform", quadrants=True))
-EVERY = (*ADAPTIVE, *UNIFORM, *QUADRANTS)
 FOUR, SIXTY_FOUR = ADAPTIVE[2], UNIFORM[2]
 
 
-def layers(figures: Path) -> tuple[list[dict[str, Any]], str]:
+def layers(run: Run) -> tuple[list[dict[str, Any]], str]:
     """Four adaptive layers against 64 uniform: error against point-sampled obscurance and against rays, and time."""
     rows: list[dict[str, Any]] = []
-    for name in ts.scenes.names():
+    for name in run.scenes:
         train, test = builtin_case(name, 0, FIT_HEIGHT), builtin_case(name, 1, FIT_HEIGHT)
         obscurance = [point_sampled(c.gbuffer, c.radius) for c in (train, test)]
         times = _times(name, repeats=5)
-        for candidate, took in zip(EVERY, times, strict=True):
+        for candidate, took in zip(_every(name), times, strict=True):
             plain = candidate.build(train.radius)
             row = {"scene": name} | candidate.row() | {"time": took}
             row["vo_unfitted"] = [
@@ -49,21 +48,32 @@ def layers(figures: Path) -> tuple[list[dict[str, Any]], str]:
                 row[f"{key}_values"] = module.values()
             rows.append(row)
             _print_layers(row)
-    _layers_picture(figures, rows)
+    rows = run.joined(rows)
+    _layers_picture(run, rows)
     return rows, _layers_statement(rows)
+
+
+def _every(scene: str) -> tuple[Candidate, ...]:
+    return (
+        *ADAPTIVE,
+        *UNIFORM,
+        *(QUADRANTS if scene in DEMANDED else ()),
+    )  # 64 layers of quadrants take minutes to fit
 
 
 def _times(name: str, repeats: int) -> list[dict[str, float]]:
     where = builtin_case(name, 0, TIME_HEIGHT)
-    modules = [candidate.build(where.radius) for candidate in EVERY]
+    modules = [candidate.build(where.radius) for candidate in _every(name)]
     return medians_ms([lambda m=m: visibility(m, where.gbuffer) for m in modules], repeats)
 
 
 def _print_layers(row: dict[str, Any]) -> None:
+    def pair(key: str) -> str:
+        return " ".join(f"{error:.4f}" for error in row[key])
+
     print(
-        f"{row['scene']:7} {row['layers']:3} {row['layering']:8} {'q' if row['quadrants'] else ' '} vo plain {row['vo_unfitted'][0]:.4f} "
-        f"{row['vo_unfitted'][1]:.4f}  vo fitted {row['vo_fitted'][0]:.4f} {row['vo_fitted'][1]:.4f}  "
-        f"rays {row['rays_fitted'][0]:.4f} {row['rays_fitted'][1]:.4f}  {row['time']['median_ms']:.0f} ms",
+        f"{row['scene']:7} {row['layers']:3} {row['layering']:8} {row['quadrants']:1} vo plain {pair('vo_unfitted')}"
+        f"  vo fitted {pair('vo_fitted')}  rays {pair('rays_fitted')}  {row['time']['median_ms']:.0f} ms",
         flush=True,
     )
 
@@ -74,7 +84,7 @@ def _pick(rows: list[dict[str, Any]], scene: str, candidate: Candidate) -> dict[
 
 def _layers_statement(rows: list[dict[str, Any]]) -> str:
     parts = []
-    for name in ts.scenes.names():
+    for name in dict.fromkeys(row["scene"] for row in rows):
         few, many = _pick(rows, name, FOUR), _pick(rows, name, SIXTY_FOUR)
         ratios = {key: few[key][0] / many[key][0] for key in ("vo_unfitted", "vo_fitted", "rays_fitted")}
         held = {key: few[key][1] / many[key][1] for key in ("vo_fitted", "rays_fitted")}
@@ -87,10 +97,10 @@ def _layers_statement(rows: list[dict[str, Any]]) -> str:
     return "; ".join(parts)
 
 
-def _layers_picture(figures: Path, rows: list[dict[str, Any]]) -> None:
+def _layers_picture(run: Run, rows: list[dict[str, Any]]) -> None:
     """Temple and street: one layer, 64 uniform, four adaptive, point-sampled obscurance, rays."""
     lines = []
-    for name in DEMANDED:
+    for name in [n for n in DEMANDED if any(r["scene"] == n for r in rows)]:
         where = builtin_case(name, 0, FIT_HEIGHT)
         line = []
         for candidate in (ADAPTIVE[0], SIXTY_FOUR, FOUR):
@@ -99,13 +109,15 @@ def _layers_picture(figures: Path, rows: list[dict[str, Any]]) -> None:
             image = visibility(module, where.gbuffer)
             line.append((f"{candidate.label}, RMSE {where.error(image):.3f}", image))
         lines.append([*line, ("ray-traced", where.truth.visibility)])
-    strip(figures / "statvo_layers.png", lines, names=DEMANDED, title="fitted to the rays (height, falloff, contrast)")
+    strip(
+        run.figures / "statvo_layers.png", lines, names=DEMANDED, title="fitted to the rays (height, falloff, contrast)"
+    )
 
 
-def monotone(figures: Path) -> tuple[list[dict[str, Any]], str]:
+def monotone(run: Run) -> tuple[list[dict[str, Any]], str]:
     """Fitted error against rays for 1, 2, 4 layers, one region and quadrants, every built-in scene."""
     rows, words = [], []
-    lines: dict[str, tuple[list[float], list[float]]] = {}
+    panels: dict[str, dict[str, tuple[list[float], list[float]]]] = {"one region": {}, "quadrants": {}}
     for name in ts.scenes.names():
         train, test = builtin_case(name, 0, FIT_HEIGHT), builtin_case(name, 1, FIT_HEIGHT)
         for quadrants in (False, True):
@@ -121,12 +133,9 @@ def monotone(figures: Path) -> tuple[list[dict[str, Any]], str]:
             kind = "quadrants" if quadrants else "one region"
             words.append(f"{name} ({kind}): {' > '.join(f'{e:.4f}' for e in errors) if falls else _not(errors)}")
             print(words[-1], flush=True)
-            if not quadrants:
-                lines[name] = ([1, 2, 4], errors)
-    title = "fitted error against rays, one region"
-    curve_axes(
-        figures / "statvo_monotone.png", lines, x="adaptive layers", y="RMSE of visibility", title=title, log_x=True
-    )
+            panels[kind][name] = ([1, 2, 4], errors)
+    x, y = "adaptive layers", "fitted RMSE against rays"
+    curves(run.figures / "statvo_monotone.png", panels, x=x, y=y, log_x=True)
     return rows, "; ".join(words)
 
 
@@ -139,7 +148,7 @@ def _constant(where: Case) -> float:
     return float(where.truth.visibility[where.valid].std(correction=0))
 
 
-def scale(figures: Path) -> tuple[list[dict[str, Any]], str]:
+def scale(run: Run) -> tuple[list[dict[str, Any]], str]:
     """Tables of half and quarter resolution: error against full ones, against obscurance and against rays, and time."""
     rows, words, lines = [], [], []
     for name in ts.scenes.names():
@@ -167,5 +176,5 @@ def scale(figures: Path) -> tuple[list[dict[str, Any]], str]:
             captions = ("full SATs", "half", "quarter")
             line = [(f"{c}, RMSE {where.error(i):.3f}", i) for c, i in zip(captions, images, strict=True)]
             lines.append([*line, ("ray-traced", where.truth.visibility)])
-    strip(figures / "statvo_scale.png", lines, names=DEMANDED, title="four adaptive layers")
+    strip(run.figures / "statvo_scale.png", lines, names=DEMANDED, title="four adaptive layers")
     return rows, "; ".join(words)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 
 import torch_ssao as ts
 from benchmarks.statvo_claims import stages
-from benchmarks.statvo_claims.common import Candidate, Case, builtin_case, case, fitted, visibility
+from benchmarks.statvo_claims.common import Candidate, Case, Run, builtin_case, case, fitted, visibility
 from benchmarks.statvo_claims.obscurance import point_sampled
 from benchmarks.statvo_claims.pictures import strip
 
@@ -23,7 +22,7 @@ SAME_NORMAL = 0.98  # cosine between the normals
 GAIN = 8.0  # of the pictures
 
 
-def temporal(figures: Path) -> tuple[list[dict[str, Any]], str]:
+def temporal(run: Run) -> tuple[list[dict[str, Any]], str]:
     """Change of visibility of a surface point from frame to frame: full, half, quarter SATs and the rays' own."""
     rows, words, lines = [], [], []
     for name in ("temple", "street"):
@@ -54,7 +53,7 @@ def temporal(figures: Path) -> tuple[list[dict[str, Any]], str]:
         )
         print(words[-1], flush=True)
     title = f"change of a surface point in one frame, darkness = {GAIN:g} times its size"
-    strip(figures / "statvo_temporal.png", lines, names=("temple", "street"), title=title)
+    strip(run.figures / "statvo_temporal.png", lines, names=("temple", "street"), title=title)
     return rows, "; ".join(words)
 
 

@@ -69,29 +69,31 @@ def crop(image: Tensor, rows: slice, columns: slice) -> Tensor:
     return image[..., rows, columns]
 
 
-def curve_axes(
+def curves(
     path: Path,
-    lines: dict[str, tuple[Sequence[float], Sequence[float]]],
+    panels: dict[str, dict[str, tuple[Sequence[float], Sequence[float]]]],
     *,
     x: str,
     y: str,
-    title: str,
     log_x: bool = False,
 ) -> None:
-    """A small plot of named lines."""
-    figure = Figure(figsize=(5.6, 3.4), dpi=100, layout="constrained")
-    axes = figure.subplots()
+    """Small plots of named lines side by side, by title."""
+    figure = Figure(figsize=(1.2 + 4.2 * len(panels), 3.4), dpi=100, layout="constrained")
     styles = ("-o", "--s", ":^", "-.d", "-x", "--v")
-    for (name, (at, values)), style in zip(lines.items(), np.resize(styles, len(lines)), strict=True):
-        axes.plot(at, values, style, label=name, markersize=4)
-    if log_x:
-        axes.set_xscale("log", base=2)
-        axes.set_xticks(sorted({a for at, _ in lines.values() for a in at}))
-        axes.get_xaxis().set_major_formatter("{x:g}")
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.set_ylim(bottom=0)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    axes.set_title(title, fontsize=9)
+    for axes, (title, lines) in zip(
+        figure.subplots(1, len(panels), squeeze=False, sharey=True)[0], panels.items(), strict=True
+    ):
+        for (name, (at, values)), style in zip(lines.items(), np.resize(styles, len(lines)), strict=True):
+            axes.plot(at, values, style, label=name, markersize=4)
+        if log_x:
+            axes.set_xscale("log", base=2)
+            axes.set_xticks(sorted({a for at, _ in lines.values() for a in at}))
+            axes.get_xaxis().set_major_formatter("{x:g}")
+        axes.set_xlabel(x)
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.3)
+        axes.set_title(title, fontsize=9)
+    first = figure.axes[0]
+    first.set_ylabel(y)
+    first.legend(fontsize=8)
     save(path, figure)
