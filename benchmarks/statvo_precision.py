@@ -205,21 +205,26 @@ def total(rows: list[dict[str, Any]], size: int, candidate: str) -> float:
 def draw(error_rows: list[dict[str, Any]], time_rows: list[dict[str, Any]], device: str, path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
     sizes = sorted({row["size"] for row in time_rows})
-    figure = Figure(figsize=(3.1 * len(sizes) + 0.6, 4.9), layout="constrained")
+    figure = Figure(figsize=(max(3.1 * len(sizes) + 0.6, 9), 4.9), layout="constrained")
     axes = figure.subplots(1, len(sizes), sharey=True, sharex=True, squeeze=False)[0]
     for axis, size in zip(axes, sizes, strict=True):
         for candidate, marker in zip(CANDIDATES, MARKERS, strict=True):
             time = total(time_rows, size, candidate.name)
             for offset, colour in COLOURS.items():
                 value = max(worst(error_rows, size, candidate.name, offset), EXACT)
-                axis.plot(time, value, marker, color=colour, ms=7, mec="white", mew=0.6, alpha=0.9)
+                size_of_marker = 11 if marker == "*" else 7
+                axis.plot(time, value, marker, color=colour, ms=size_of_marker, mec="white", mew=0.6, alpha=0.9)
         axis.axhline(1, color="black", lw=1)
         axis.set(xscale="log", yscale="log", title=f"{size} × {size}")
         axis.grid(True, which="major", color="0.9")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axis.xaxis.set_minor_formatter(NullFormatter())
     axes[0].set_ylabel(f"worst error of a box mean / bound (0 drawn at {EXACT:g})")
-    axes[0].text(0.03, 1.3, "bound", transform=axes[0].get_yaxis_transform(), fontsize=8)
+    axes[0].text(0.72, 1.4, "the bound", transform=axes[0].get_yaxis_transform(), fontsize=8)
     figure.supxlabel(f"build + one 17 × 17 lookup a pixel, ms a megapixel ({device})", fontsize=9)
     handles = [
         Line2D([], [], ls="", marker=m, color="0.4", label=c.name) for c, m in zip(CANDIDATES, MARKERS, strict=True)
