@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--figures", type=Path, default=Path("docs/figures"))
     parser.add_argument(
         "--scenes",
-        nargs="+",
+        nargs="*",
         default=ts.scenes.names(),
         help="of the claim layers, which takes minutes a scene; the others keep their rows",
     )

@@ -83,14 +83,14 @@ def pillars(run: Run) -> tuple[list[dict[str, Any]], str]:
     values = shared.values()
     obscurance = point_sampled(where.gbuffer, **values)
     rows, line = [], []
-    for count in (1, 2, 4, 8, 16):
-        image = visibility(Candidate(count).build(**values), where.gbuffer)
-        own, _ = fitted(Candidate(count), small)
-        row = {"layers": count, "rmse_rays": where.error(image), "rmse_vo": where.error(image, obscurance)}
+    for candidate in (*(Candidate(n) for n in (1, 2, 4, 8, 16)), Candidate(4, quadrants=True)):
+        image = visibility(candidate.build(**values), where.gbuffer)
+        own, _ = fitted(candidate, small)
+        row = candidate.row() | {"rmse_rays": where.error(image), "rmse_vo": where.error(image, obscurance)}
         row["rmse_rays_own_fit"] = where.error(visibility(own, where.gbuffer))
         row |= {"values": values, "own_values": own.values()}
         rows.append(row)
-        line.append((f"{count} layer{'s' * (count > 1)}, {row['rmse_vo']:.3f} / {row['rmse_rays']:.3f}", image))
+        line.append((f"{candidate.label}, {row['rmse_vo']:.3f} / {row['rmse_rays']:.3f}", image))
     line += [
         (f"point-sampled, 0 / {where.error(obscurance):.3f}", obscurance),
         ("ray-traced", where.truth.visibility),
@@ -101,8 +101,8 @@ def pillars(run: Run) -> tuple[list[dict[str, Any]], str]:
     strip(run.figures / "statvo_pillars.png", [cut[:4], cut[4:]], title=title)
     rows.append({"layers": None, "rmse_vo": 0.0, "rmse_rays": where.error(obscurance)})
     words = [
-        f"{r['layers']} layers: {r['rmse_vo']:.4f} from point-sampled obscurance, {r['rmse_rays']:.4f} from rays "
-        f"(own fit {r['rmse_rays_own_fit']:.4f})"
+        f"{r['layers']} layers{', quadrants' * r['quadrants']}: {r['rmse_vo']:.4f} from point-sampled obscurance, "
+        f"{r['rmse_rays']:.4f} from rays (own fit {r['rmse_rays_own_fit']:.4f})"
         for r in rows[:-1]
     ]
     return rows, "; ".join([*words, f"point-sampled obscurance itself: {rows[-1]['rmse_rays']:.4f} from rays"])

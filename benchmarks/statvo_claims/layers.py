@@ -41,10 +41,12 @@ def layers(run: Run) -> tuple[list[dict[str, Any]], str]:
             row["vo_unfitted"] = [
                 c.error(visibility(plain, c.gbuffer), o) for c, o in zip((train, test), obscurance, strict=True)
             ]
-            for key, target in (("vo_fitted", obscurance[0]), ("rays_fitted", None)):
+            targets = {"vo_fitted": obscurance, "rays_fitted": [train.truth, test.truth.visibility]}
+            if candidate in QUADRANTS:
+                del targets["vo_fitted"]
+            for key, (target, judge) in targets.items():
                 module, error = fitted(candidate, train, target)
-                judge = test.error(visibility(module, test.gbuffer), obscurance[1] if key == "vo_fitted" else None)
-                row[key] = [error, judge]
+                row[key] = [error, test.error(visibility(module, test.gbuffer), judge)]
                 row[f"{key}_values"] = module.values()
             rows.append(row)
             _print_layers(row)
@@ -69,7 +71,7 @@ def _times(name: str, repeats: int) -> list[dict[str, float]]:
 
 def _print_layers(row: dict[str, Any]) -> None:
     def pair(key: str) -> str:
-        return " ".join(f"{error:.4f}" for error in row[key])
+        return " ".join(f"{error:.4f}" for error in row.get(key, ()))
 
     print(
         f"{row['scene']:7} {row['layers']:3} {row['layering']:8} {row['quadrants']:1} vo plain {pair('vo_unfitted')}"

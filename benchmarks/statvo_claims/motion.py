@@ -35,7 +35,10 @@ def temporal(run: Run) -> tuple[list[dict[str, Any]], str]:
             f"{label} SATs": visibility(Candidate(4, sat_scale=s).build(**values), where.gbuffer)
             for label, s in (("full", 1), ("half", 2), ("quarter", 4))
         }
-        films |= {"point-sampled": point_sampled(where.gbuffer, **values), "ray-traced": where.truth.visibility}
+        films |= {
+            "point-sampled": point_sampled(where.gbuffer, **values, grid=12),
+            "ray-traced": where.truth.visibility,
+        }
         same, grid, moved = _reprojection(where)
         line = []
         for label, film in films.items():
