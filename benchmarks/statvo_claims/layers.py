@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
+
+from torch import Tensor
 
 import torch_ssao as ts
 from benchmarks.statvo_claims.common import (
@@ -20,7 +23,8 @@ from benchmarks.statvo_claims.pictures import curves, strip
 
 FIT_HEIGHT = 120
 TIME_HEIGHT = 240
-SCALE_HEIGHT = 240
+SCALE_HEIGHTS = (240, 480)
+SHOWN = ("temple", "pipes")  # of the coarse tables: little and much harm
 DEMANDED = ("temple", "street")
 ADAPTIVE = tuple(Candidate(n) for n in (1, 2, 4, 8))
 UNIFORM = tuple(Candidate(n, "uniform") for n in (4, 16, 64))
@@ -65,8 +69,7 @@ def _every(scene: str) -> tuple[Candidate, ...]:
 
 def _times(name: str, repeats: int) -> list[dict[str, float]]:
     where = builtin_case(name, 0, TIME_HEIGHT)
-    modules = [candidate.build(where.radius) for candidate in _every(name)]
-    return medians_ms([lambda m=m: visibility(m, where.gbuffer) for m in modules], repeats)
+    return medians_ms(_renders([candidate.build(where.radius) for candidate in _every(name)], where), repeats)
 
 
 def _print_layers(row: dict[str, Any]) -> None:
@@ -154,29 +157,43 @@ def scale(run: Run) -> tuple[list[dict[str, Any]], str]:
     """Tables of half and quarter resolution: error against full ones, against obscurance and against rays, and time."""
     rows, words, lines = [], [], []
     for name in ts.scenes.names():
-        where = builtin_case(name, 0, SCALE_HEIGHT)
         values = fitted(FOUR, builtin_case(name, 0, FIT_HEIGHT))[0].values()
-        obscurance = point_sampled(where.gbuffer, **values)
-        modules = [Candidate(4, sat_scale=s).build(**values) for s in (1, 2, 4)]
-        images = [visibility(m, where.gbuffer) for m in modules]
-        times = medians_ms([lambda m=m, g=where.gbuffer: visibility(m, g) for m in modules], 5)
-        for s, image, took in zip((1, 2, 4), images, times, strict=True):
-            row = {"scene": name, "sat_scale": s, "footprint_px": median_footprint(where), "time": took}
-            row |= {"rmse_full": where.error(image, images[0]), "rmse_vo": where.error(image, obscurance)}
-            row |= {"rmse_rays": where.error(image), "worst_full": float((image - images[0]).abs().max())}
-            rows.append(row)
-        one, two, four = rows[-3:]
-        words.append(
-            f"{name}: half and quarter differ from full by {two['rmse_full']:.4f} and {four['rmse_full']:.4f} RMSE; "
-            f"against rays {one['rmse_rays']:.4f}, {two['rmse_rays']:.4f}, {four['rmse_rays']:.4f}; "
-            f"against obscurance {one['rmse_vo']:.4f}, {two['rmse_vo']:.4f}, {four['rmse_vo']:.4f}; "
-            f"{one['time']['median_ms'] / two['time']['median_ms']:.1f} and "
-            f"{one['time']['median_ms'] / four['time']['median_ms']:.1f} times faster"
-        )
-        print(words[-1], flush=True)
-        if name in DEMANDED:
-            captions = ("full SATs", "half", "quarter")
-            line = [(f"{c}, RMSE {where.error(i):.3f}", i) for c, i in zip(captions, images, strict=True)]
-            lines.append([*line, ("ray-traced", where.truth.visibility)])
-    strip(run.figures / "statvo_scale.png", lines, names=DEMANDED, title="four adaptive layers")
+        for height in SCALE_HEIGHTS:
+            mine, images = _scales(name, height, values)
+            rows += mine
+            words.append(_scale_words(name, height, mine))
+            print(words[-1], flush=True)
+            if name in SHOWN and height == SCALE_HEIGHTS[0]:
+                where = builtin_case(name, 0, height)
+                captions = ("full SATs", "half", "quarter")
+                line = [(f"{c}, RMSE {r['rmse_rays']:.3f}", i) for c, r, i in zip(captions, mine, images, strict=True)]
+                lines.append([*line, ("ray-traced", where.truth.visibility)])
+    strip(run.figures / "statvo_scale.png", lines, names=SHOWN, title="four adaptive layers, 320 x 240")
     return rows, "; ".join(words)
+
+
+def _scales(name: str, height: int, values: dict[str, float]) -> tuple[list[dict[str, Any]], list[Tensor]]:
+    where = builtin_case(name, 0, height)
+    obscurance = point_sampled(where.gbuffer, **values)
+    modules = [Candidate(4, sat_scale=s).build(**values) for s in (1, 2, 4)]
+    images = [visibility(m, where.gbuffer) for m in modules]
+    rows = []
+    for s, image, took in zip((1, 2, 4), images, medians_ms(_renders(modules, where), 5), strict=True):
+        row = {"scene": name, "height": height, "sat_scale": s, "footprint_px": median_footprint(where), "time": took}
+        row |= {"rmse_full": where.error(image, images[0]), "rmse_vo": where.error(image, obscurance)}
+        rows.append(row | {"rmse_rays": where.error(image), "worst_full": float((image - images[0]).abs().max())})
+    return rows, images
+
+
+def _scale_words(name: str, height: int, rows: list[dict[str, Any]]) -> str:
+    one, two, four = rows
+    faster = [one["time"]["median_ms"] / r["time"]["median_ms"] for r in (two, four)]
+    return (
+        f"{name}, {height} rows: half and quarter differ from full by {two['rmse_full']:.4f} and {four['rmse_full']:.4f} "
+        f"RMSE; against rays {', '.join(format(r['rmse_rays'], '.4f') for r in rows)}; against obscurance "
+        f"{', '.join(format(r['rmse_vo'], '.4f') for r in rows)}; {faster[0]:.1f} and {faster[1]:.1f} times faster"
+    )
+
+
+def _renders(modules: list[ts.StatVO], where: Case) -> list[Callable[[], Tensor]]:
+    return [lambda m=m: visibility(m, where.gbuffer) for m in modules]
