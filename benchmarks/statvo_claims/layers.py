@@ -55,7 +55,8 @@ def layers(run: Run) -> tuple[list[dict[str, Any]], str]:
             rows.append(row)
             _print_layers(row)
     rows = run.joined(rows)
-    _layers_picture(run, rows)
+    if {row["scene"] for row in rows} >= set(DEMANDED):
+        _layers_picture(run, rows)
     return rows, _layers_statement(rows)
 
 
@@ -99,16 +100,24 @@ def _layers_statement(rows: list[dict[str, Any]]) -> str:
             f"{ratios['vo_fitted']:.2f} (obscurance, fitted; other view {held['vo_fitted']:.2f}), "
             f"{ratios['rays_fitted']:.2f} (rays, fitted; other view {held['rays_fitted']:.2f}), {speed:.1f} times faster"
         )
+        if name in DEMANDED:
+            four = _pick(rows, name, QUADRANTS[0])
+            parts[-1] += (
+                f"; with quadrants {four['vo_unfitted'][0] / many['vo_unfitted'][0]:.2f} (obscurance, same parameters), "
+                f"{four['rays_fitted'][0] / many['rays_fitted'][0]:.2f} (rays, fitted; other view "
+                f"{four['rays_fitted'][1] / many['rays_fitted'][1]:.2f}), "
+                f"{many['time']['median_ms'] / four['time']['median_ms']:.1f} times faster than 64 uniform of one region"
+            )
     return "; ".join(parts)
 
 
 def _layers_picture(run: Run, rows: list[dict[str, Any]]) -> None:
-    """Temple and street: one layer, 64 uniform, four adaptive, point-sampled obscurance, rays."""
+    """Temple and street: one layer, 64 uniform, four adaptive without and with quadrants, rays."""
     lines = []
-    for name in [n for n in DEMANDED if any(r["scene"] == n for r in rows)]:
+    for name in DEMANDED:
         where = builtin_case(name, 0, FIT_HEIGHT)
         line = []
-        for candidate in (ADAPTIVE[0], SIXTY_FOUR, FOUR):
+        for candidate in (ADAPTIVE[0], SIXTY_FOUR, FOUR, QUADRANTS[0]):
             values = _pick(rows, name, candidate)["rays_fitted_values"]
             module = candidate.build(**values)
             image = visibility(module, where.gbuffer)
