@@ -9,7 +9,7 @@ from torch import Tensor
 from torch_ssao import checks
 from torch_ssao.camera import Camera
 from torch_ssao.modules.base import AmbientVisibility, ParameterSpec, Positive
-from torch_ssao.ops.statvo import statvo_obscurance
+from torch_ssao.ops.statvo import check_choices, statvo_obscurance
 
 
 @final
@@ -71,15 +71,8 @@ class StatVO(AmbientVisibility):
         surrogate_width: float = 0.25,
         learnable: str | tuple[str, ...] = (),
     ) -> None:
-        checks.check_choice("layering", layering, ("adaptive", "uniform"))
-        checks.check_count("layers", layers, 1, 256)
-        if layering == "adaptive" and layers & (layers - 1):
-            below = 1 << (layers.bit_length() - 1)
-            raise checks.RangeError(f"layers must be a power of two, got {layers}: use {below} or {2 * below}")
+        check_choices(layers, layering, sat_scale, gradient, surrogate_width)
         checks.check_choice("quadrants", quadrants, (False, True))
-        checks.check_choice("sat_scale", sat_scale, (1, 2, 4))
-        checks.check_choice("gradient", gradient, ("exact",) if layering == "uniform" else ("exact", "surrogate"))
-        checks.check_positive("surrogate_width", surrogate_width)
         values = {"radius": radius, "height": height, "falloff": falloff, "contrast": contrast}
         choices = {
             "layers": layers,

@@ -59,6 +59,17 @@ class Response(NamedTuple):
     to_slope: Tensor
 
 
+class _Cotangents(NamedTuple):
+    """What the backward pass adds up over the layers; `rise` (B, H, W) is that of the height of the mean over the centre."""
+
+    position: Tensor
+    normal: Tensor
+    half: Tensor
+    rise: Tensor
+    box_height: Tensor
+    slope: Tensor
+
+
 class LayeredObscurance:
     """What value, pull-back and push-forward share."""
 
@@ -84,6 +95,7 @@ class LayeredObscurance:
                 response = self._respond(sat.cell_sums(leaf.table, lattice), rows)
                 total[:, :, rows] += response.amount * response.value
                 count[:, :, rows] += response.amount
+            del leaf  # before the next table is made
         dtype = self.samples.position.dtype
         boxes = torch.where(count > 0, total.div_(count.clamp(min=MIN_COUNT)), 0.0).clamp_(max=1)
         held = (count > 0).sum(1).clamp(min=1)
@@ -155,51 +167,48 @@ class LayeredObscurance:
         """
         samples, queries = self.samples, self.queries
         soft = SoftPartition(samples, self.settings.layers, queries.width) if self._is_soft() else None
-        decisions = soft.zeros() if soft else None
-        to_position = samples.position.new_zeros(samples.position.shape)
-        to_normal, to_half = (
-            torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (queries.normal, queries.half)
+        decisions = soft.zeros() if soft else grad[:0]
+        into = _Cotangents(
+            samples.position.new_zeros(samples.position.shape),
+            *(torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (queries.normal, queries.half)),
+            *(torch.zeros_like(t, dtype=torch.float64) for t in (grad, queries.box_height, queries.slope)),
         )
-        to_rise_sum = torch.zeros_like(grad, dtype=torch.float64)
-        to_box, to_slope = (torch.zeros_like(t, dtype=torch.float64) for t in (queries.box_height, queries.slope))
         for leaf in self._leaves(labels):
-            to_table = torch.zeros_like(leaf.table)
-            for outer in sat.scatter_blocks(*grad.shape[1:]):
-                to_sums = leaf.table.new_empty((*boxes.shape[:2], 4, outer.stop - outer.start, grad.shape[2]))
-                for rows, lattice in self._windows(outer):
-                    response = self._respond(sat.cell_sums(leaf.table, lattice), rows)
-                    sums, rise, slope = self._derivatives(response, boxes, count, rows)
-                    weight = grad[:, None, rows].double()
-                    inside = slice(rows.start - outer.start, rows.stop - outer.start)
-                    torch.mul(sums, weight[:, :, None], out=to_sums[:, :, :, inside])
-                    rise = rise * weight
-                    to_rise_sum[:, rows] += rise.sum(1)
-                    to_normal[:, :, rows] += (rise[:, :, None] * response.mean).sum(1)
-                    to_box -= (rise * response.height).flatten(1).sum(1)
-                    to_slope += (slope * weight).flatten(1).sum(1)
-                lattice = self._lattice(outer)
-                lines = sat.cell_sums_pull_back(to_sums, leaf.table, lattice, to_table)
-                to_half[:, :, outer] += half_from_lines(*lines, lattice, samples.size)
-            to_samples = sat.summed_area_table_adjoint(to_table)
+            to_samples = self._pull_back_leaf(leaf, grad, boxes, count, into)
             for axis in range(3):
                 moved = to_samples[:, axis, None] * samples.mass
-                to_position[:, axis] = torch.where(leaf.member, moved.to(to_position.dtype), to_position[:, axis])
+                into.position[:, axis] = torch.where(leaf.member, moved.to(grad.dtype), into.position[:, axis])
             if soft:
                 soft.add_membership_cotangent(decisions, self._to_member(to_samples), soft.rounds, leaf.label)
+            del leaf, to_samples  # before the next table is made
         to_sample_half = samples.half.new_zeros((grad.shape[0], 0))
         if soft:
             to_depth, to_sample_half = soft.pull_back(decisions)
-            to_position[:, 2] += to_depth.to(to_position.dtype)
-        to_centre = (-to_rise_sum[:, None] * queries.normal).to(to_position.dtype)
-        return [
-            to_position,
-            to_sample_half,
-            to_centre,
-            to_normal,
-            to_half,
-            to_box.to(grad.dtype),
-            to_slope.to(grad.dtype),
-        ]
+            into.position[:, 2] += to_depth.to(grad.dtype)
+        to_centre = (-into.rise[:, None] * queries.normal).to(grad.dtype)
+        scalars = (into.box_height.to(grad.dtype), into.slope.to(grad.dtype))
+        return [into.position, to_sample_half, to_centre, into.normal, into.half, *scalars]
+
+    def _pull_back_leaf(self, leaf: Leaf, grad: Tensor, boxes: Tensor, count: Tensor, into: _Cotangents) -> Tensor:
+        """Cotangents (B, 4, h, w) of what one layer's table was made of; those of the queries are added to `into`."""
+        to_table = torch.zeros_like(leaf.table)
+        for outer in sat.scatter_blocks(*grad.shape[1:]):
+            to_sums = leaf.table.new_empty((*boxes.shape[:2], 4, outer.stop - outer.start, grad.shape[2]))
+            for rows, lattice in self._windows(outer):
+                response = self._respond(sat.cell_sums(leaf.table, lattice), rows)
+                sums, rise, slope = self._derivatives(response, boxes, count, rows)
+                weight = grad[:, None, rows].double()
+                inside = slice(rows.start - outer.start, rows.stop - outer.start)
+                torch.mul(sums, weight[:, :, None], out=to_sums[:, :, :, inside])
+                rise = rise * weight
+                into.rise[:, rows] += rise.sum(1)
+                into.normal[:, :, rows] += (rise[:, :, None] * response.mean).sum(1)
+                into.box_height.sub_((rise * response.height).flatten(1).sum(1))
+                into.slope.add_((slope * weight).flatten(1).sum(1))
+            lattice = self._lattice(outer)
+            lines = sat.cell_sums_pull_back(to_sums, leaf.table, lattice, to_table)
+            into.half[:, :, outer] += half_from_lines(*lines, lattice, self.samples.size)
+        return sat.summed_area_table_adjoint(to_table)
 
     def push_forward(self, tangents: dict[str, Tensor | None], labels: Tensor, boxes: Tensor, count: Tensor) -> Tensor:
         """Tangent of the obscurance, (B, H, W).
@@ -210,9 +219,9 @@ class LayeredObscurance:
         samples, queries = self.samples, self.queries
         position, half = tangents["position"], tangents["half"]
         soft = SoftPartition(samples, self.settings.layers, queries.width) if self._is_soft() else None
-        decisions = (
-            soft.push_forward(None if position is None else position[:, 2], tangents["sample_half"]) if soft else None
-        )
+        decisions = []
+        if soft:
+            decisions = soft.push_forward(None if position is None else position[:, 2], tangents["sample_half"])
         total = torch.zeros_like(queries.seen, dtype=torch.float64)
         for leaf in self._leaves(labels):
             moving = self._moving_table(leaf, position, soft, decisions)
@@ -226,6 +235,7 @@ class LayeredObscurance:
                     slopes = half_from_lines(*sat.edge_slopes(to_sums, leaf.table, lattice), lattice, samples.size)
                     tangent = tangent + (slopes * half[:, :, rows]).sum(1)
                 total[:, rows] += tangent
+            del leaf, moving
         return total.to(samples.position.dtype)
 
     def _own_tangent(
@@ -245,10 +255,10 @@ class LayeredObscurance:
         return tangent
 
     def _moving_table(
-        self, leaf: Leaf, position: Tensor | None, soft: SoftPartition | None, decisions: list[Tensor] | None
+        self, leaf: Leaf, position: Tensor | None, soft: SoftPartition | None, decisions: list[Tensor]
     ) -> Tensor | None:
         """Table of the tangents of a layer's samples; None when nothing moves."""
-        if position is None and decisions is None:
+        if position is None and soft is None:
             return None
         mass = self.samples.mass.double()
         joined = None if soft is None else mass * soft.membership_tangent(decisions, soft.rounds, leaf.label)

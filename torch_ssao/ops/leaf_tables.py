@@ -45,8 +45,7 @@ def leaf_tables(samples: Samples, centre: Tensor, labels: Tensor, layers: int, *
 
 def sample_table(samples: Samples, centre: Tensor, member: Tensor) -> Tensor:
     """(B, 4, h + 1, w + 1) table of the members' positions relative to the centre and of their mass, summed over the L images."""
-    table = sat.empty_table(samples.position)
-    table = torch.cat((table, table[:, :1]), 1)
+    table = sat.empty_table(samples.position, channels=4)
     weight = torch.where(member, samples.mass, 0).double()
     for axis in range(3):
         apart = samples.position[:, axis].double() - centre[:, axis, None, None, None]

@@ -139,7 +139,7 @@ class Partition:
     def table(self, member: Tensor) -> Tensor:
         """Two-channel table of a node: depth relative to the centre, and mass."""
         samples = self.samples
-        table = sat.empty_table(samples.position[:, :2])
+        table = sat.empty_table(samples.position, channels=2)
         weight = torch.where(member, samples.mass, 0).double()
         table[:, 1, 1:, 1:] = weight.sum(1)
         table[:, 0, 1:, 1:] = weight.mul_(samples.position[:, 2].double() - self.centre).sum(1)

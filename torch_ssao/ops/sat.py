@@ -68,7 +68,7 @@ class Lattice:
         return Lattice(lines[0], lines[1], block)
 
     def grid(self, height: int, width: int) -> Tensor:
-        """(K, B, R, S, 2) normalised coordinates of all crossings in a table of height + 1 rows and width + 1 columns; x fastest."""
+        """(K, B, R, S, 2) normalised coordinates of all crossings in a table of (height + 1) x (width + 1); x fastest."""
         x = [line * (2 / (width * self.block)) - 1 for line in self.xs]
         y = [line * (2 / (height * self.block)) - 1 for line in self.ys]
         return torch.stack([torch.stack((a, b), -1) for b in y for a in x])
@@ -88,13 +88,14 @@ def scatter_blocks(rows: int, columns: int) -> Iterator[slice]:
         yield slice(start, min(start + count, rows))
 
 
-def empty_table(samples: Tensor) -> Tensor:
+def empty_table(like: Tensor, *, channels: int) -> Tensor:
     """(B, C, H + 1, W + 1) float64 zeros; write samples into `[..., 1:, 1:]`, then call `accumulate`.
 
     Args:
-        samples: any tensor whose first and last two dimensions are (B, C, ..., H, W).
+        like: any tensor of shape (B, ..., H, W) on the device.
     """
-    return samples.new_zeros((*samples.shape[:2], samples.shape[-2] + 1, samples.shape[-1] + 1), dtype=torch.float64)
+    shape = (like.shape[0], channels, like.shape[-2] + 1, like.shape[-1] + 1)
+    return like.new_zeros(shape, dtype=torch.float64)
 
 
 def accumulate(table: Tensor) -> Tensor:
@@ -112,7 +113,7 @@ def summed_area_table(samples: Tensor) -> Tensor:
     Cost: two passes; 8 C bytes a pixel.
     Source: Crow 1984.
     """
-    table = empty_table(samples)
+    table = empty_table(samples, channels=samples.shape[1])
     table[:, :, 1:, 1:] = samples
     return accumulate(table)
 
@@ -167,7 +168,7 @@ def cell_sums_pull_back(
     Returns: cotangents of `lattice.xs` and of `lattice.ys`, each (B, R, S).
     Cost: about 5 C additions a corner, plus one zeroed band of the table for each horizontal line.
     """
-    batch, channels, height, width = table.shape
+    height, width = table.shape[2:]
     side = len(lattice.xs) - 1
     cells = to_sums.unflatten(1, (side, side))
     to_x = [torch.zeros_like(line) for line in lattice.xs]
@@ -193,7 +194,7 @@ def edge_slopes(to_sums: Tensor, table: Tensor, lattice: Lattice) -> tuple[tuple
     """The cotangents of the lines alone, as `cell_sums_pull_back` gives them: for forward mode, where to_sums is contracted."""
     _, _, height, width = table.shape
     grid = lattice.grid(height - 1, width - 1)
-    corners, batch, rows, columns, _ = grid.shape
+    _, batch, rows, columns, _ = grid.shape
     cells = to_sums.unflatten(1, (len(lattice.ys) - 1, -1))
     lines = [_line_cotangent(cells, j) for j in range(len(lattice.ys))]
     cotangent = torch.stack(lines, 1).permute(0, 3, 1, 2, 4, 5).flatten(2, 4)
@@ -251,9 +252,11 @@ def _cells(values: Tensor, columns: int, rows: int) -> Tensor:
 
 def _line_cotangent(cells: Tensor, line: int) -> Tensor:
     """Adjoint of `_cells` at one horizontal line: (B, Qy, Qx, C, R, S) cell cotangents -> (B, Kx, C, R, S)."""
-    above = cells[:, line - 1] if line > 0 else 0
-    below = cells[:, line] if line < cells.shape[1] else 0
-    row = above - below
+    row = torch.zeros_like(cells[:, 0])
+    if line > 0:
+        row += cells[:, line - 1]
+    if line < cells.shape[1]:
+        row -= cells[:, line]
     edge = torch.zeros_like(row[:, :1])
     return torch.cat((edge, row), 1) - torch.cat((row, edge), 1)
 

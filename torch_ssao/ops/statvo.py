@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torch_ssao import checks
 from torch_ssao.ops.statvo_function import layered_obscurance
 
 
@@ -42,7 +43,7 @@ def statvo_obscurance(
         layering: "adaptive" - a tree of splits at local means; "uniform" - slices of the image's depth range.
         quadrants: evaluate the four quarters of the window that meet at the pixel (nine lookups) and average those that hold
             samples.
-        sat_scale: 1, 2, 4, ...: partition and tables are made of the mean positions of blocks of so many pixels a side, with
+        sat_scale: 1, 2 or 4: partition and tables are made of the mean positions of blocks of so many pixels a side, with
             the number of valid pixels carried along; every pixel is still evaluated.
         differential: build half of the layers' tables by subtraction (adaptive layers only): faster to build, more memory.
         gradient: "exact" holds labels constant, which is right almost everywhere; "surrogate" lets a label count as
@@ -57,27 +58,28 @@ def statvo_obscurance(
         pixel (eight with quadrants), whatever the layers.
     Source: Statistical Volumetric Obscurance, Eqs. 3-7, Secs. 4 to 7.
     """
-    position, mass, sample_half = points, valid, half
-    if sat_scale > 1:
-        position, mass, sample_half = _blocks(points, valid, half, sat_scale)
-    return layered_obscurance(
-        position,
-        mass,
-        sample_half,
-        points[:, :, 0],
-        normal,
-        valid[:, 0],
-        half[:, :, 0],
-        box_height,
-        slope,
-        (surrogate_width * box_height).detach(),
-        layers,
-        layering,
-        quadrants,
-        sat_scale,
-        differential,
-        gradient,
-    )
+    check_choices(layers, layering, sat_scale, gradient, surrogate_width)
+    samples = (points, valid, half) if sat_scale == 1 else _blocks(points, valid, half, sat_scale)
+    queries = (points[:, :, 0], normal, valid[:, 0], half[:, :, 0])
+    scalars = (box_height, slope, (surrogate_width * box_height).detach())
+    choices = (layers, layering, quadrants, sat_scale, differential, gradient)
+    return layered_obscurance(*samples, *queries, *scalars, *choices)
+
+
+def check_choices(layers: int, layering: str, sat_scale: int, gradient: str, surrogate_width: float) -> None:
+    """Raise RangeError or ChoiceError unless the discrete choices of `statvo_obscurance` fit together."""
+    checks.check_choice("layering", layering, ("adaptive", "uniform"))
+    checks.check_count("layers", layers, 1, 256)
+    if layering == "adaptive" and layers & (layers - 1):
+        below = 1 << (layers.bit_length() - 1)
+        raise checks.RangeError(f"layers must be a power of two, got {layers}: use {below} or {2 * below}")
+    checks.check_choice("sat_scale", sat_scale, (1, 2, 4))
+    checks.check_choice("gradient", gradient, ("exact", "surrogate"))
+    if layering == "uniform" and gradient == "surrogate":
+        raise checks.ChoiceError(
+            "gradient must be 'exact' with uniform layers, got 'surrogate': choose layering='adaptive'"
+        )
+    checks.check_positive("surrogate_width", surrogate_width)
 
 
 def _blocks(points: Tensor, valid: Tensor, half: Tensor, side: int) -> tuple[Tensor, Tensor, Tensor]:
