@@ -65,9 +65,6 @@ class StatVO(AmbientVisibility):
         values = {"radius": radius, "height": height, "falloff": falloff, "contrast": contrast}
         super().__init__(values, {"layers": layers, "layering": layering}, learnable)
 
-    def used_parameters(self) -> tuple[str, ...]:
-        return tuple(self.PARAMETERS)
-
     def _visibility(
         self, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera, *, frame: int, backend: str
     ) -> Tensor:
