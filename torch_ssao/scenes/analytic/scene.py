@@ -151,7 +151,7 @@ class AnalyticScene:
             closed form holds.
         Raises: RangeError, ChoiceError.
         Gradients: none.
-        Cost: about 0.5 us a pixel on one core, 3 us where a falloff is integrated numerically.
+        Cost: about 0.5 us a pixel on one core, 1 to 10 us where a form is integrated numerically.
         """
         closed_forms.check_question(radius, falloff, weighting)
         question = Question(radius=radius, falloff=falloff, weighting=weighting)

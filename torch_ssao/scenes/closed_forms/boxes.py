@@ -24,7 +24,7 @@ from torch_ssao.scenes.closed_forms.common import (
     positive,
 )
 
-_EDGE = 1e-9  # of a side: where three faces meet, visibility depends on the way there; points keep off them
+_EDGE = 1e-12  # of a side: where three faces meet, visibility depends on the way there; points keep off them
 _SMALL = 1e-200  # keeps quotients finite where 0 multiplies them away
 
 Range = tuple[ArrayLike, ArrayLike]

@@ -60,7 +60,7 @@ def disk_above(
         return blocked * q * c**3 * _kernel(c, kernel) * _falloff(h / c / radius, exponent)
 
     furthest = np.minimum(a + r, np.sqrt(np.maximum(radius - h, 0.0)) * np.sqrt(radius + h)) / h
-    return 1.0 - _from_zero(ring, (np.abs(a - r) / h, 1.0, furthest), furthest) / math.pi
+    return 1.0 - _from_zero(ring, (np.abs(a - r) / h, 1.0, 1e3, furthest), furthest) / math.pi
 
 
 def bowl(
