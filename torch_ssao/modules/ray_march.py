@@ -95,8 +95,8 @@ class RayMarchedSSAO(AmbientVisibility):
         batch, layers, height, width = depth.shape
         points = camera.unproject(depth)
         rotation, _ = tiled_noise(height, width, frame, dtype=depth.dtype, device=depth.device)
-        values = (self.radius, self.falloff, self.thickness)
-        radius, falloff, thickness = (None if v is None else v.to(depth.dtype).expand(batch) for v in values)
+        radius, falloff = (value.to(depth.dtype).expand(batch) for value in (self.radius, self.falloff))
+        thickness = None if self.thickness is None else self.thickness.to(depth.dtype).expand(batch)
         intrinsics = torch.stack((camera.fx, camera.fy, camera.cx, camera.cy), 1).to(depth.dtype)
         nearest = _repaired(normal) if normal is not None else normals_from_points(points[:, :, 0], valid[:, 0])
         deeper = [normals_from_points(points[:, :, layer], valid[:, layer]) for layer in range(1, layers)]

@@ -83,7 +83,7 @@ def ray_march_visibility(
         thickness,
         tangent_planes(points, normal, orthographic=orthographic).flatten(2, 3).transpose(1, 2).contiguous(),
         valid.flatten(2).transpose(1, 2),
-        intrinsics,
+        intrinsics.detach(),
     )
     return visibility.unflatten(1, (height, width))
 
@@ -100,7 +100,8 @@ def tangent_planes(points: Tensor, normal: Tensor, *, orthographic: bool) -> Ten
     if orthographic:
         ray = points.new_tensor([0.0, 0.0, 1.0]).view(1, 3, 1, 1, 1)
     else:
-        ray = points / torch.linalg.vector_norm(points, dim=1, keepdim=True).clamp(min=torch.finfo(points.dtype).tiny)
+        length = points.square().sum(1, keepdim=True).clamp(min=torch.finfo(points.dtype).tiny).sqrt()
+        ray = points / length
     lacking = ((normal * ray).sum(1, keepdim=True) + MIN_FACING).clamp(min=0)
     facing = normal - lacking * ray
     return torch.cat((facing, (facing * points).sum(1, keepdim=True)), 1).movedim(1, -1)
@@ -180,7 +181,8 @@ class _March(NamedTuple):
             targets = [target for target in block.cut(totals) if target is not None]
             for target, part in zip(targets, parts, strict=True):
                 target += part
-            flat.index_add_(0, piece.rows_at.flatten(), rows.flatten(0, -3).flatten(1))
+            if needed[5]:
+                flat.index_add_(0, piece.rows_at.flatten(), rows.flatten(0, -3).flatten(1))
         return [total for total, want in zip([*totals, planes], needed, strict=False) if want and total is not None]
 
     def push_forward(self, tangents: Sequence[Tensor | None], outputs: Outputs, *tensors: Tensor | None) -> Tensor:
@@ -230,7 +232,7 @@ class _Piece:
         self.rows_at = self.steps.sample
         if spec.gradient == "exact":
             self.found = self.inside.any(0)
-            self.first = self.inside.to(torch.uint8).argmax(0, keepdim=True)
+            self.first = hit.first_inside(self.inside)
             pair = torch.cat(((self.first - 1).clamp(min=0), self.first))
             self.rows_at = self.steps.sample.gather(0, pair)
             self.pair_known = torch.stack([known[..., layer].gather(0, pair) for layer in range(known.shape[-1])], -1)

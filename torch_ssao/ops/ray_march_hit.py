@@ -64,7 +64,8 @@ def march(pixels: Pixels, direction: Tensor, steps: int) -> Tensor:
 
 def tolerance(pixels: Pixels) -> Tensor:
     """Distance from a stored plane within which a step counts as in front: rounding of positions (b, P)."""
-    size = torch.linalg.vector_norm(pixels.position, dim=0) + pixels.reach
+    x, y, z = pixels.position
+    size = (x**2 + y**2 + z**2).sqrt() + pixels.reach  # a norm over the first axis is slow on CPUs
     return ROUNDING * torch.finfo(size.dtype).eps * size
 
 
@@ -104,6 +105,16 @@ def is_inside(behind: Tensor, height: Tensor, known: Tensor, slack: Tensor, thic
             solid = solid & (behind[..., entry] <= thickness)
         inside = inside | solid
     return inside
+
+
+def first_inside(inside: Tensor) -> Tensor:
+    """Number of steps before the first one inside, (1, ...) int64 of (J, ...) bool; J - 1 where there is none."""
+    free = ~inside[0]
+    before = free.to(torch.int64)
+    for step in inside[1:-1]:  # argmax over the first axis is slow on CPUs
+        free = free & ~step
+        before += free
+    return before[None].clamp(max=inside.shape[0] - 1)
 
 
 def soft_inside(behind: Tensor, known: Tensor, width: Tensor, thickness: Tensor | None) -> Tensor:

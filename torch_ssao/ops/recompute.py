@@ -34,8 +34,11 @@ class Kernel(Protocol):
         """Tangent of the output."""
 
 
+@torch.compiler.disable
 def recompute(kernel: Kernel, *tensors: Tensor | None) -> Tensor:
     """Apply a kernel: reverse mode, forward mode and vmap work, second derivatives raise a RuntimeError.
+
+    `torch.compile` leaves it as it is, with a graph break: unrolled, its loops would compile for minutes.
 
     Args:
         kernel: see `Kernel`.
@@ -43,8 +46,7 @@ def recompute(kernel: Kernel, *tensors: Tensor | None) -> Tensor:
     Returns: the kernel's output.
     Gradients: by the kernel, for every floating tensor.
     """
-    function = _Recompute if torch.compiler.is_compiling() else _RecomputeWithJvp
-    return function.apply(kernel, *tensors)[0]
+    return _Recompute.apply(kernel, *tensors)[0]
 
 
 def pull_back(
@@ -111,10 +113,6 @@ class _Recompute(_Folding):
         needed = ctx.needs_input_grad[1:]
         grads = iter(_PullBack.apply(ctx.kernel, needed, ctx.outputs, grad, *ctx.saved_tensors))
         return None, *(next(grads) if want else None for want in needed)
-
-
-class _RecomputeWithJvp(_Recompute):
-    """The same with forward mode, which dynamo refuses to trace."""
 
     @staticmethod
     def jvp(ctx: Any, _: None, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
