@@ -16,6 +16,7 @@ from torch_ssao.ops.recompute import Outputs, pull_back, push_forward, recompute
 BLOCK = {"cpu": 2**18, "cuda": 2**21}  # taps worked on at a time: what fits a cache, what fills a GPU
 ESTIMATORS = ("increments", "bitmask")
 WEIGHTINGS = ("cosine", "uniform")
+FOOTPRINT_STEP = 0.05  # relative change of the footprint over which its effect is differenced
 MIN_PIXELS = 4096  # of a block, where there are as many: fewer, and the slices are split instead
 
 
@@ -39,6 +40,7 @@ def horizon_obscurance(
     estimator: str,
     connected: bool = False,
     max_radius_px: float | None = None,
+    footprint_step: float = FOOTPRINT_STEP,
 ) -> Tensor:
     """Obscurance of every pixel from slices of directions through it.
 
@@ -85,7 +87,7 @@ def horizon_obscurance(
     normal = torch.where(known, normal, normal.new_tensor([0.0, 0.0, -1.0]).view(1, 3, 1, 1))
     planes = taps.surface_planes(depth, valid, intrinsics[:, :2], orthographic=orthographic)
     layout = taps.Layout(slices, steps, step_power, orthographic, max_radius_px)
-    kernel = _Horizon(layout, weighting == "cosine", estimator, connected, rotation, offset)
+    kernel = _Horizon(layout, weighting == "cosine", estimator, connected, rotation, offset, footprint_step)
     obscurance = recompute(kernel, planes, valid, normal, intrinsics, radius, falloff, thickness, bias)
     return torch.where(valid, obscurance, 0.0).clamp(0, 1)
 
@@ -108,6 +110,7 @@ class _Horizon(NamedTuple):
     connected: bool
     rotation: Tensor
     offset: Tensor
+    footprint_step: float
     name: str = "horizon_obscurance"
 
     def value(self, *tensors: Tensor | None) -> Outputs:
@@ -129,6 +132,10 @@ class _Horizon(NamedTuple):
         for block in self._blocks(inputs):
             piece = slice(block.start, block.stop)
             level, normal, read, *rest = pull_back(block.function, block.leaves, (cotangent[piece],))
+            if self.footprint_step > 0:
+                own = block.pull_back_spread(cotangent[piece] * block.by_spread(inputs))
+                level = level + own[0]
+                rest[0], rest[1] = rest[0] + own[1], rest[1] + own[2]
             to_planes[0, piece] += level
             to_normal[:, piece] += normal
             to_planes.index_add_(1, block.texels.source.flatten(), read.flatten(1))
@@ -149,6 +156,8 @@ class _Horizon(NamedTuple):
             piece = slice(block.start, block.stop)
             leaves = block.leaves_of(moved)
             total[piece] += push_forward(block.function, block.leaves, leaves)[0]
+            if self.footprint_step > 0:
+                total[piece] += block.by_spread(inputs) * block.push_spread(leaves)
         return total.view_as(inputs.planes[:, 0])
 
     def _blocks(self, inputs: _Inputs) -> Iterator[_Block]:
@@ -165,15 +174,17 @@ class _Horizon(NamedTuple):
 
 
 class _Block:
-    """Some pixels and some of their slices."""
+    """Some pixels and some of their slices; `spread` is a factor on the taps' distances."""
 
-    def __init__(self, kernel: _Horizon, inputs: _Inputs, start: int, stop: int, slices: range) -> None:
-        self.kernel, self.start, self.stop = kernel, start, stop
+    def __init__(
+        self, kernel: _Horizon, inputs: _Inputs, start: int, stop: int, slices: range, spread: float = 1.0
+    ) -> None:
+        self.kernel, self.start, self.stop, self.slices = kernel, start, stop, slices
         size = (inputs.planes.shape[2], inputs.planes.shape[3])
         self.pixels = taps.make_pixels(start, stop, slices, kernel.layout, size, kernel.rotation, kernel.offset)
         level, normal = self._own(inputs)
         frame = taps.make_frame(level, normal, inputs.intrinsics, inputs.radius, self.pixels, kernel.layout)
-        self.texels = taps.find_texels(frame, self.pixels, inputs.valid)
+        self.texels = taps.find_texels(frame, self.pixels, inputs.valid, spread)
         self.leaves = self.leaves_of(inputs)
         self.has_thickness = inputs.thickness is not None
 
@@ -199,3 +210,33 @@ class _Block:
         else:
             amount = arcs.covered_intervals(measure, frame, found, thickness, bias, connected=kernel.connected)
         return (amount / kernel.layout.slices,)
+
+    def by_spread(self, inputs: _Inputs) -> Tensor:
+        """Derivative (P,) to the logarithm of the taps' spread: a difference, since taps move by whole pixels."""
+        step = self.kernel.footprint_step
+        further, nearer = (
+            _Block(self.kernel, inputs, self.start, self.stop, self.slices, 1 + sign * step) for sign in (1, -1)
+        )
+        change = further.function(*further.leaves)[0] - nearer.function(*nearer.leaves)[0]
+        cap = self.kernel.layout.max_radius_px
+        if cap is not None:  # where it holds, the spread depends on nothing
+            level, intrinsics, radius = (self.leaves[i] for i in (0, 3, 4))
+            span = radius[self.pixels.image] * intrinsics[self.pixels.image, :2].amax(1)
+            span = span if self.kernel.layout.orthographic else span * level
+            change = torch.where(span < cap, change, 0.0)
+        return change / (2 * step)
+
+    def pull_back_spread(self, to_spread: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cotangents of level (P,), intrinsics (B, 4) and radius (B,) from that of the spread, R f / z in pixels."""
+        level, intrinsics, radius = (self.leaves[i] for i in (0, 3, 4))
+        to_level = torch.zeros_like(level) if self.kernel.layout.orthographic else to_spread / level
+        total = torch.zeros_like(radius).index_add_(0, self.pixels.image, to_spread)
+        to_focal = 0.5 * total[:, None] / intrinsics[:, :2]
+        return to_level, torch.cat((to_focal, torch.zeros_like(to_focal)), 1), total / radius
+
+    def push_spread(self, tangents: Sequence[Tensor]) -> Tensor:
+        """Tangent (P,) of the logarithm of the spread."""
+        level, intrinsics, radius = (self.leaves[i] for i in (0, 3, 4))
+        moved = tangents[4] / radius + 0.5 * (tangents[3] / intrinsics)[:, :2].sum(1)
+        own = 0.0 if self.kernel.layout.orthographic else tangents[0] / level
+        return moved[self.pixels.image] + own

@@ -15,7 +15,6 @@ from torch import Tensor
 from torch_ssao.ops.sampling import GOLDEN
 
 SLOPE_LIMIT = 64.0  # a depth step of more pixel footprints than this a pixel is an edge, not a slope (89.1 degrees)
-MIN_TAP_PX = 1.0  # a tap nearer than this would read the pixel itself
 WIDEST = 0.9  # of |x|: the radius up to which the footprint of the whole sphere, not of its equator, is sampled
 HORIZON = 1e-3  # of 1/z at the texel's centre: a plane seen at less is past its horizon
 NEAREST = 0.05  # a tap ray that meets the slice's line this close to the eye's plane is left out
@@ -163,44 +162,44 @@ def make_frame(
     )
 
 
-def place_taps(frame: Frame, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Reach along the slice, image offset (x, y) in pixels, and the recession of the taps, (S, 2, K, P)."""
+class Texels(NamedTuple):
+    """Which texel each tap reads, (S, 2, K, P); none of it is differentiable."""
+
+    count: Tensor  # pixels from the centre along the slice's major image axis, >= 1
+    column: Tensor
+    row: Tensor
+    source: Tensor  # index into the flattened batch
+    seen: Tensor  # bool: exists and is valid
+
+
+def find_texels(frame: Frame, pixels: Pixels, valid: Tensor, spread: float) -> Texels:
+    """Round the taps to whole pixels along the major axis.
+
+    Args:
+        valid: (B, H, W) bool.
+        spread: factor on the taps' distances.
+    """
+    _, height, width = valid.shape
     longest = frame.radius
     if frame.distance is not None:  # the sphere of radius R is wider in the image than its equator
         part = (frame.radius / frame.distance).clamp(max=WIDEST)
         longest = longest * (1 - part * part).rsqrt()
-    shortest = MIN_TAP_PX / (frame.step_x**2 + frame.step_y**2).sqrt()
-    reach = torch.maximum(longest * pixels.share, shortest[:, None, None])
-    side = reach.new_tensor([1.0, -1.0]).view(2, 1, 1)
-    signed = side * reach
-    if frame.recession is None:
-        return reach, signed * frame.step_x[:, None, None], signed * frame.step_y[:, None, None], None
-    away = 1 + signed * frame.recession[:, None, None]
-    shrunk = signed / away.clamp(min=NEAREST)
-    return reach, shrunk * frame.step_x[:, None, None], shrunk * frame.step_y[:, None, None], away
-
-
-class Texels(NamedTuple):
-    """Which texel each tap reads, (S, 2, K, P) integers; seen says whether it exists and is valid."""
-
-    column: Tensor
-    row: Tensor
-    source: Tensor  # into the flattened batch
-    seen: Tensor
-
-
-def find_texels(frame: Frame, pixels: Pixels, valid: Tensor) -> Texels:
-    """The texels the taps fall into. Args: valid: (B, H, W) bool. Gradients: none."""
-    _, height, width = valid.shape
-    _, offset_x, offset_y, away = place_taps(frame, pixels)
+    reach = longest * pixels.share * spread
+    if frame.recession is not None:
+        signed = _sides(reach) * reach
+        reach = reach / (1 + signed * frame.recession[:, None, None]).clamp(min=NEAREST)
+    major = torch.maximum(frame.step_x.abs(), frame.step_y.abs())
+    furthest = float(max(height, width))  # beyond it every tap is off the image
+    count = (reach * major[:, None, None]).round().clamp(1.0, furthest)
+    _, offset_x, offset_y, away = _place(frame, count)
     column = (pixels.column + 0.5 + offset_x).floor()
     row = (pixels.row + 0.5 + offset_y).floor()
     seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     if away is not None:
-        seen = seen & (away > NEAREST)
+        seen = seen & (away > NEAREST) & (away < 1 / NEAREST)
     column, row = (torch.where(seen, texel, 0).long() for texel in (column, row))
-    index = (pixels.image * height + row) * width + column
-    return Texels(column, row, index, seen & valid.reshape(-1)[index])
+    source = (pixels.image * height + row) * width + column
+    return Texels(count, column, row, source, seen & valid.reshape(-1)[source])
 
 
 def meet_surface(frame: Frame, pixels: Pixels, texels: Texels, planes: Tensor) -> Taps:
@@ -209,12 +208,29 @@ def meet_surface(frame: Frame, pixels: Pixels, texels: Texels, planes: Tensor) -
     Args:
         planes: (3, S, 2, K, P) `surface_planes` at the texels.
     """
-    reach, offset_x, offset_y, away = place_taps(frame, pixels)
+    reach, offset_x, offset_y, away = _place(frame, texels.count)
     inside_x = pixels.column + offset_x - texels.column
     inside_y = pixels.row + offset_y - texels.row
     level = planes[0] + planes[1] * inside_x + planes[2] * inside_y
     if away is None or frame.distance is None:
         return Taps(reach, frame.depth - level, reach, texels.seen)
     seen = texels.seen & (level > HORIZON * planes[0])  # beyond, the tap's ray misses the plane
+    reach, away = torch.where(seen, reach, 1.0), torch.where(seen, away, 1.0)
     scale = 1 / torch.where(seen, level * frame.depth * away, 1.0)
     return Taps(scale * reach, (1 - scale) * frame.distance, reach, seen)
+
+
+def _sides(like: Tensor) -> Tensor:
+    return like.new_tensor([1.0, -1.0]).view(2, 1, 1)
+
+
+def _place(frame: Frame, count: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Reach along the slice, image offset (x, y) in pixels and recession of the taps some whole pixels away."""
+    major = torch.maximum(frame.step_x.abs(), frame.step_y.abs())
+    shrunk = _sides(count) * count / major[:, None, None]
+    offset_x, offset_y = shrunk * frame.step_x[:, None, None], shrunk * frame.step_y[:, None, None]
+    if frame.recession is None:
+        return shrunk.abs(), offset_x, offset_y, None
+    left = 1 - shrunk * frame.recession[:, None, None]
+    left = torch.where(left > NEAREST, left, NEAREST)
+    return (shrunk / left).abs(), offset_x, offset_y, 1 / left
