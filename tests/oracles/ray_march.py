@@ -38,9 +38,12 @@ class Image:
     eps: float
 
 
-def hemisphere_direction(point: Floats, turn: float, normal: Floats) -> Floats:
-    """A disk point turned in the eye's XY plane, lifted to the hemisphere about -z, and aligned to the normal."""
+def hemisphere_direction(point: Floats, turn: float, outwards: float, normal: Floats) -> Floats:
+    """A disk point moved within its ring and turned in the eye's XY plane, lifted to the hemisphere about -z, and aligned
+    to the normal. `outwards` is what is added to the square of its radius."""
     angle = 2.0 * math.pi * turn
+    square = float(point @ point)
+    point = point * math.sqrt(max(0.0, square + outwards) / square)
     x = point[0] * math.cos(angle) - point[1] * math.sin(angle)
     y = point[0] * math.sin(angle) + point[1] * math.cos(angle)
     lifted = np.array([x, y, -math.sqrt(max(0.0, 1.0 - point[0] ** 2 - point[1] ** 2))])
@@ -132,6 +135,7 @@ def ray_march_visibility(
     intrinsics: npt.ArrayLike,
     disk: npt.ArrayLike,
     rotation: npt.ArrayLike,
+    offset: npt.ArrayLike,
     *,
     orthographic: bool,
     steps: int,
@@ -145,13 +149,14 @@ def ray_march_visibility(
     Args:
         positions, normals: (B, 3, L, H, W) view space. valid: (B, L, H, W) bool.
         reach: (B, H, W) length of the rays. intrinsics: (B, 4) fx, fy, cx, cy.
-        disk: (K, 2) points of the unit disk. rotation: (H, W) turns.
+        disk: (K, 2) points of the unit disk. rotation: (H, W) turns. offset: (H, W) in [0, 1), places within rings.
         falloff, contrast: exponents. thickness: of the reach, or None. eps: of the dtype under test.
     """
     x = np.moveaxis(np.asarray(positions, np.float64), 1, -1)
     n = np.moveaxis(np.asarray(normals, np.float64), 1, -1)
     usable, lengths = np.asarray(valid, bool), np.asarray(reach, np.float64)
     points, turns = np.asarray(disk, np.float64), np.asarray(rotation, np.float64)
+    shifts = (np.asarray(offset, np.float64) - 0.5) / len(points)
     answer = np.ones(lengths.shape)
     for b in range(len(x)):
         camera = tuple(float(value) for value in np.asarray(intrinsics, np.float64)[b])
@@ -159,10 +164,10 @@ def ray_march_visibility(
         for row, column in np.argwhere(usable[b, 0]):
             start, normal = x[b, 0, row, column], n[b, 0, row, column]
             rays = [
-                ray_visibility(
-                    image, start, hemisphere_direction(point, turns[row, column], normal), lengths[b, row, column]
+                ray_visibility(image, start, direction, lengths[b, row, column])
+                for direction in (
+                    hemisphere_direction(point, turns[row, column], shifts[row, column], normal) for point in points
                 )
-                for point in points
             ]
             weight = sum(share for _, share in rays)
             mean = sum(value * share for value, share in rays) / weight if weight > 0.0 else 1.0

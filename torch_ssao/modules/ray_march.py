@@ -94,7 +94,7 @@ class RayMarchedSSAO(AmbientVisibility):
     ) -> Tensor:
         batch, layers, height, width = depth.shape
         points = camera.unproject(depth)
-        rotation, _ = tiled_noise(height, width, frame, dtype=depth.dtype, device=depth.device)
+        rotation, offset = tiled_noise(height, width, frame, dtype=depth.dtype, device=depth.device)
         radius, falloff = (value.to(depth.dtype).expand(batch) for value in (self.radius, self.falloff))
         thickness = None if self.thickness is None else self.thickness.to(depth.dtype).expand(batch)
         intrinsics = torch.stack((camera.fx, camera.fy, camera.cx, camera.cy), 1).to(depth.dtype)
@@ -110,6 +110,7 @@ class RayMarchedSSAO(AmbientVisibility):
             intrinsics,
             poisson_disk(self.rays, dtype=depth.dtype, device=depth.device),
             rotation,
+            offset,
             steps=self.steps,
             orthographic=camera.is_orthographic,
             gradient=self.gradient,

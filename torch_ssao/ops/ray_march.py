@@ -27,6 +27,7 @@ def ray_march_visibility(
     intrinsics: Tensor,
     disk: Tensor,
     rotation: Tensor,
+    offset: Tensor,
     *,
     steps: int,
     orthographic: bool,
@@ -35,12 +36,12 @@ def ray_march_visibility(
 ) -> Tensor:
     """Visibility of every pixel from rays marched through the depth layers.
 
-    Rays start at the nearest layer, directions are disk points turned by `rotation`, lifted to the hemisphere and
-    aligned to the normal. Step j = 1 ... `steps` at j R / steps reads the whole pixel it falls on; the stored sample
-    stands for its tangent plane there, so that a plane never occludes itself at any angle (up to 88.9 degrees, where
-    slopes are capped): the allowance for a pixel's footprint is its slope times the step's offset from the pixel's centre,
-    and a step must lie 8 eps (|x| + R) below the plane. The first step inside a solid is a hit, at the distance of Eq. 1;
-    a ray counts 1 without a hit, 1 - W_p(distance / R) with one.
+    Rays start at the nearest layer; directions are disk points turned by `rotation` and shifted within their rings,
+    lifted to the hemisphere and aligned to the normal. Step j = 1 ... `steps` at j R / steps reads the whole pixel it
+    falls on; the stored sample stands for its tangent plane there, so that a plane never occludes itself at any angle
+    (up to 88.9 degrees, where slopes are capped): the allowance for a pixel's footprint is its slope times the step's
+    offset from the pixel's centre, and a step must lie 8 eps (|x| + R) below the plane. The first step inside a solid
+    is a hit, at the distance of Eq. 1; a ray counts 1 without a hit, 1 - W_p(distance / R) with one.
     Layers 0, 1, 2, ... are entry, exit, entry, ...: inside is behind an entry and before the next valid exit, and, with
     a thickness, no deeper than that behind the entry.
     Steps off the screen or behind the eye never occlude; a ray counts by the share of its steps that fall in the image
@@ -54,8 +55,9 @@ def ray_march_visibility(
         falloff: (B,) exponent p of the attenuation, > 0.
         thickness: (B,) of the reach, > 0; None for solids without end.
         intrinsics: (B, 4) fx, fy, cx, cy in pixels.
-        disk: (K, 2) points inside the unit disk, one a ray.
-        rotation: (H, W) turns.
+        disk: (K, 2) points inside the unit disk, one a ray, one a ring of equal area.
+        rotation, offset: (H, W) turns of the disk, and places of the points within their rings, in [0, 1): noise over
+            which the mean does not depend on the number of rays.
         steps: steps a ray, >= 1.
         orthographic: parallel projection along +z.
         gradient: "exact" - almost everywhere, hits held constant: through Eq. 1 and W. "surrogate" - a hit
@@ -75,7 +77,7 @@ def ray_march_visibility(
     height, width = valid.shape[2:]
     spec = _Spec(steps, height, width, orthographic, gradient, surrogate_width)
     visibility = recompute(
-        _March(spec, disk, rotation.reshape(-1)),
+        _March(spec, disk, rotation.reshape(-1), offset.reshape(-1)),
         points[:, :, 0].flatten(2),
         normal[:, :, 0].flatten(2),
         reach.flatten(1),
@@ -155,6 +157,7 @@ class _March(NamedTuple):
     spec: _Spec
     disk: Tensor
     rotation: Tensor
+    offset: Tensor
     name: str = "ray_march_visibility"
 
     def value(self, *tensors: Tensor | None) -> Outputs:
@@ -217,11 +220,12 @@ class _Piece:
 
     def __init__(self, kernel: _March, block: _Block, inputs: _Inputs) -> None:
         self.spec = spec = kernel.spec
-        self.disk, self.rotation = kernel.disk[block.rays], kernel.rotation[block.pixels]
+        noise = kernel.rotation[block.pixels], kernel.offset[block.pixels]
+        self.sampling = kernel.disk[block.rays], len(kernel.disk), *noise
         cut = block.cut(inputs[:5])
         self.given = [part is not None for part in cut]
         pixels = Pixels(*cut)  # type: ignore[arg-type]
-        place = hit.march(pixels, hit.directions(pixels.normal, self.disk, self.rotation), spec.steps)
+        place = hit.march(pixels, hit.directions(pixels.normal, *self.sampling), spec.steps)
         self.steps = _read(place, inputs, block, spec)
         self.weight = self.steps.seen.to(pixels.reach.dtype).mean(0)
         rows = _rows(inputs.planes, self.steps.sample)
@@ -243,7 +247,7 @@ class _Piece:
         """Weighted visibility (b, P), summed over the rays of the block; `leaves` as `self.leaves`."""
         parts = iter(leaves[:-1])
         pixels = Pixels(*(next(parts) if given else None for given in self.given))  # type: ignore[arg-type]
-        direction = hit.directions(pixels.normal, self.disk, self.rotation)
+        direction = hit.directions(pixels.normal, *self.sampling)
         open_share = self._at_hit if self.spec.gradient == "exact" else self._along
         return ((self.weight * open_share(pixels, direction, leaves[-1])).sum(0),)
 

@@ -36,20 +36,25 @@ class Steps(NamedTuple):
     known: Tensor  # (J, K, b, P, L) bool: stored sample is valid
 
 
-def directions(normal: Tensor, disk: Tensor, rotation: Tensor) -> Tensor:
-    """Unit directions about the normals: disk points turned per pixel, lifted to the hemisphere, aligned to the normal.
+def directions(normal: Tensor, disk: Tensor, count: int, rotation: Tensor, offset: Tensor) -> Tensor:
+    """Unit directions about the normals: disk points moved per pixel, lifted to the hemisphere, aligned to the normal.
 
     Args:
         normal: (3, b, P) unit.
         disk: (K, 2) points of the unit disk; a uniform disk lifts to a cosine-weighted hemisphere.
-        rotation: (P,) turns.
+        count: number of points of the whole disk, of which `disk` may hold some.
+        rotation: (P,) turns. offset: (P,) place of each point within its ring of area pi / count, in [0, 1): averaged over
+            offsets a few points cover the disk as evenly as many.
     Returns: (3, K, b, P). The hemisphere about (0, 0, -1) is turned along the shortest arc onto the normal.
     Gradients: to normal.
     """
     cosine, sine = torch.cos(2 * math.pi * rotation), torch.sin(2 * math.pi * rotation)
-    u, v = disk[:, 0, None, None], disk[:, 1, None, None]
+    area = disk.square().sum(1)[:, None, None]
+    moved = (area + (offset - 0.5) / count).clamp(0, 1)
+    scale = (moved / area.clamp(min=torch.finfo(area.dtype).tiny)).sqrt()
+    u, v = disk[:, 0, None, None] * scale, disk[:, 1, None, None] * scale
     a, b = u * cosine - v * sine, u * sine + v * cosine
-    c = (1 - u**2 - v**2).clamp(min=0).sqrt()
+    c = (1 - moved).sqrt()
     x, y, z = normal[:, None]
     across = a * x + b * y
     share = c - across / (1 - z).clamp(min=_AWAY)
