@@ -1,4 +1,19 @@
-"""Horizon-based obscurance: slices of directions through each pixel, taps along them, arcs that they close."""
+"""Horizon-based obscurance: slices of directions through each pixel, taps along them, arcs that they close.
+
+A slice is a plane through the eye and the pixel's point x. On either side of x, each tap reads one texel, a whole number of
+pixels away along the slice's major image axis, and meets that texel's plane exactly in the slice: a plane occludes nothing,
+and no geometry is made up across edges. With e the elevation of a tap over the tangent plane and a(e) the share of the
+hemisphere below it (cosine-weighted, or of solid angle), on each side of each slice the obscurance grows
+- "increments": by 1/2 (W_{k-1} + W_k) (a(H_k) - a(H_{k-1})) where tap k raises the horizon H, W = 1 - (distance / R)^p; W_k
+  alone where taps k-1 and k are not one surface; with a thickness, only by the part of the rise that the occluder covers;
+- "bitmask": by the length of the union of the arcs [a(e_back), a(e_front)] that the occluders cover, each the piece of its
+  tap's view ray from the surface to `thickness` R behind it, clipped to the sphere of radius R about x. The union is exact:
+  the limit of infinitely many sectors.
+
+Taps move by whole pixels, so the derivative along the footprint R f / z is zero almost everywhere, and the gradient of the
+*expected* estimate is not. It is made of two parts: the exact derivative with the texels held, and the effect of the
+footprint's size, differenced over +-`FOOTPRINT_STEP` of it with the same noise and handed on to R, z and f.
+"""
 
 from __future__ import annotations
 
@@ -42,18 +57,7 @@ def horizon_obscurance(
     max_radius_px: float | None = None,
     footprint_step: float = FOOTPRINT_STEP,
 ) -> Tensor:
-    """Obscurance of every pixel from slices of directions through it.
-
-    A slice is a plane through the eye and the pixel's point x. On either side of x, `steps` taps read one texel each and
-    meet that texel's plane exactly in the slice, so a plane occludes nothing and no geometry is made up across edges. With
-    e the elevation of a tap over the tangent plane and a(e) the share of the hemisphere below it (cosine-weighted, or of
-    solid angle), on each side of each slice the obscurance grows
-    - "increments": by 1/2 (W_{k-1} + W_k) (a(H_k) - a(H_{k-1})) where tap k raises the horizon H, W = 1 - (distance / R)^p;
-      W_k alone where taps k-1 and k are not one surface; with a thickness, only by the part of the rise that the tap's
-      occluder covers;
-    - "bitmask": by the length of the union of the arcs [a(e_back), a(e_front)] that the occluders cover, each the piece of
-      its tap's view ray from the surface to `thickness` R behind it, clipped to the sphere of radius R about x. The union is
-      exact: the limit of infinitely many sectors.
+    """Obscurance of every pixel from slices of directions through it; the module says how.
 
     Args:
         depth: (B, H, W) view-space z, scene units, > 0 where valid and finite everywhere.
@@ -71,13 +75,13 @@ def horizon_obscurance(
         estimator: "increments" or "bitmask".
         connected: "bitmask" also covers the arcs between neighbouring taps of one surface.
         max_radius_px: shortens R where it spans more pixels; None never.
+        footprint_step: of the footprint, over which its effect is differenced in derivatives.
     Returns: (B, H, W) obscurance in [0, 1].
-    Gradients: to depth, normal, intrinsics, radius, falloff, thickness and bias; which texel a tap reads is held constant.
-        Because a tap meets its texel's plane at its exact place, it moves with R, z and the camera along the surface, and
-        d / d R is that of the tap positions, the attenuation and the thickness together. Forward mode alike. Second
-        derivatives raise a RuntimeError.
+    Gradients: to depth, normal, intrinsics, radius, falloff, thickness and bias, of the expected estimate (above);
+        footprint_step = 0 gives the derivative almost everywhere. Of a change of the footprint by fx and fy each takes half.
+        Forward mode alike. Second derivatives raise a RuntimeError.
     Cost: blocks of about 2^18 taps (2^21 on a GPU), one alive at a time, forward and backward; saved: the inputs and three
-        floats a pixel, whatever the taps.
+        floats a pixel, whatever the taps. Backward costs about five times forward.
     Raises: ChoiceError.
     Source: HBAO (Bavoil, Sainz, Dimitrov 2008), GTAO (Jimenez et al. 2016), visibility bitmasks (Therrien et al. 2023).
     """

@@ -165,7 +165,7 @@ def make_frame(
 class Texels(NamedTuple):
     """Which texel each tap reads, (S, 2, K, P); none of it is differentiable."""
 
-    count: Tensor  # pixels from the centre along the slice's major image axis, >= 1
+    pixels: Tensor  # away along the slice's major image axis, >= 1
     column: Tensor
     row: Tensor
     source: Tensor  # index into the flattened batch
@@ -208,7 +208,7 @@ def meet_surface(frame: Frame, pixels: Pixels, texels: Texels, planes: Tensor) -
     Args:
         planes: (3, S, 2, K, P) `surface_planes` at the texels.
     """
-    reach, offset_x, offset_y, away = _place(frame, texels.count)
+    reach, offset_x, offset_y, away = _place(frame, texels.pixels)
     inside_x = pixels.column + offset_x - texels.column
     inside_y = pixels.row + offset_y - texels.row
     level = planes[0] + planes[1] * inside_x + planes[2] * inside_y
