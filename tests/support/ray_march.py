@@ -108,6 +108,23 @@ def bumps(count: int, height: int, width: int, *, sigma: float = 3.0, seed: int 
     return torch.exp(-((y - centre[:, 0]) ** 2 + (x - centre[:, 1]) ** 2) / (2 * sigma**2))
 
 
+def smooth_gbuffer(height: int, width: int) -> ts.GBuffer:
+    """A bumpy surface without edges, with the exact normals of its depth."""
+    camera = ts.Camera.perspective(50.0, height, width).to(torch.float64)
+
+    def position(u: Tensor, v: Tensor) -> Tensor:
+        x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+        a, b = 2.6 * (u / width - 0.5), 2 * (v / height - 0.5)
+        z = 4 + 0.25 * torch.sin(5 * a) * torch.cos(4 * b) - 0.5 * torch.exp(-8 * ((a + 0.6) ** 2 + (b - 0.3) ** 2))
+        return torch.stack((x * z, y * z, z))
+
+    rows, columns = (torch.arange(size, dtype=torch.float64) + 0.5 for size in (height, width))
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    right, down = (position(u + e, v + f) - position(u - e, v - f) for e, f in ((1e-4, 0.0), (0.0, 1e-4)))
+    normal = torch.nn.functional.normalize(torch.linalg.cross(down, right, dim=0), dim=0)
+    return ts.GBuffer(position(u, v)[None, 2:], camera, normal=normal[None])
+
+
 def with_depth(gb: ts.GBuffer, depth: Tensor) -> ts.GBuffer:
     """The same normals and camera on another depth, of any batch."""
     return ts.GBuffer(depth, gb.camera, normal=gb.normal.expand(len(depth), -1, -1, -1))
