@@ -126,8 +126,8 @@ def test_depth_gradient_predicts_small_smooth_bumps(options: dict) -> None:
     pair = torch.tensor([predicted, found])
     slope = float((pair[0] * pair[1]).sum() / pair[1].square().sum())
     correlation = float(torch.corrcoef(pair)[0, 1])
-    assert correlation >= 0.98, (correlation, slope)
-    assert abs(slope - 1) <= 0.06, (correlation, slope)
+    assert correlation >= 0.995, (correlation, slope)
+    assert abs(slope - 1) <= 0.03, (correlation, slope)
 
 
 def test_vmap_and_second_derivative() -> None:
