@@ -1,4 +1,16 @@
-"""Ray-marched screen-space ambient occlusion: Poisson-disk rays through depth layers."""
+"""Ray-marched screen-space ambient occlusion: Poisson-disk rays through depth layers.
+
+Rays start at the nearest layer; directions are disk points turned by `rotation` and shifted within their rings,
+lifted to the hemisphere and aligned to the normal. Step j = 1 ... `steps` at j R / steps reads the whole pixel it
+falls on; the stored sample stands for its tangent plane there, so that a plane never occludes itself at any angle
+(up to 88.9 degrees, where slopes are capped): the allowance for a pixel's footprint is its slope times the step's
+offset from the pixel's centre, and a step must lie 8 eps (|x| + R) below the plane. The first step inside a solid
+is a hit, at the distance of Eq. 1; a ray counts 1 without a hit, 1 - W_p(distance / R) with one.
+Layers 0, 1, 2, ... are entry, exit, entry, ...: inside is behind an entry and before the next valid exit, and, with
+a thickness, no deeper than that behind the entry.
+Steps off the screen or behind the eye never occlude; a ray counts by the share of its steps that fall in the image
+(whatever they meet), and pixels of which nothing was seen are open. Invalid samples are open space.
+"""
 
 from __future__ import annotations
 
@@ -36,16 +48,7 @@ def ray_march_visibility(
 ) -> Tensor:
     """Visibility of every pixel from rays marched through the depth layers.
 
-    Rays start at the nearest layer; directions are disk points turned by `rotation` and shifted within their rings,
-    lifted to the hemisphere and aligned to the normal. Step j = 1 ... `steps` at j R / steps reads the whole pixel it
-    falls on; the stored sample stands for its tangent plane there, so that a plane never occludes itself at any angle
-    (up to 88.9 degrees, where slopes are capped): the allowance for a pixel's footprint is its slope times the step's
-    offset from the pixel's centre, and a step must lie 8 eps (|x| + R) below the plane. The first step inside a solid
-    is a hit, at the distance of Eq. 1; a ray counts 1 without a hit, 1 - W_p(distance / R) with one.
-    Layers 0, 1, 2, ... are entry, exit, entry, ...: inside is behind an entry and before the next valid exit, and, with
-    a thickness, no deeper than that behind the entry.
-    Steps off the screen or behind the eye never occlude; a ray counts by the share of its steps that fall in the image
-    (whatever they meet), and pixels of which nothing was seen are open. Invalid samples are open space.
+    How rays march, what a hit is and what the screen's edge does: see the module.
 
     Args:
         points: (B, 3, L, H, W) view-space positions, scene units, finite everywhere.
