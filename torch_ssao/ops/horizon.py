@@ -97,14 +97,22 @@ def horizon_obscurance(
 
 
 class _Inputs(NamedTuple):
-    planes: Tensor  # (B, 3, H, W)
-    valid: Tensor
-    normal: Tensor
+    """As the pieces read them: images flat, channels first."""
+
+    planes: Tensor  # (3, B H W)
+    valid: Tensor  # (B, H, W)
+    normal: Tensor  # (3, B H W)
     intrinsics: Tensor  # (B, 4)
     radius: Tensor  # (B,)
     falloff: Tensor
     thickness: Tensor | None
     bias: Tensor
+
+    @staticmethod
+    def of(tensors: Sequence[Tensor | None]) -> _Inputs:
+        planes, valid, normal, *rest = tensors
+        flat = [None if t is None else t.transpose(0, 1).flatten(1) for t in (planes, normal)]
+        return _Inputs(flat[0], valid, flat[1], *rest)  # type: ignore[arg-type]
 
 
 class _Horizon(NamedTuple):
@@ -118,19 +126,17 @@ class _Horizon(NamedTuple):
     name: str = "horizon_obscurance"
 
     def value(self, *tensors: Tensor | None) -> Outputs:
-        inputs = _Inputs(*tensors)  # type: ignore[arg-type]
-        total = torch.zeros_like(inputs.planes[:, 0]).flatten()
+        inputs = _Inputs.of(tensors)
+        total = torch.zeros_like(inputs.planes[0])
         for block in self._blocks(inputs):
             total[block.start : block.stop] += block.function(*block.leaves)[0]
-        return (total.view_as(inputs.planes[:, 0]),)
+        return (total.view(inputs.valid.shape),)
 
     def pull_back(
         self, grad: Tensor, needed: Sequence[bool], outputs: Outputs, *tensors: Tensor | None
     ) -> list[Tensor]:
-        inputs = _Inputs(*tensors)  # type: ignore[arg-type]
-        shape = inputs.planes.shape
-        to_planes = inputs.planes.new_zeros(3, shape[0] * shape[2] * shape[3])
-        to_normal = torch.zeros_like(to_planes)
+        inputs = _Inputs.of(tensors)
+        to_planes, to_normal = torch.zeros_like(inputs.planes), torch.zeros_like(inputs.normal)
         to_rest = [torch.zeros_like(t) for t in inputs[3:] if t is not None]
         cotangent = grad.reshape(-1)
         for block in self._blocks(inputs):
@@ -142,31 +148,30 @@ class _Horizon(NamedTuple):
                 rest[0], rest[1] = rest[0] + own[1], rest[1] + own[2]
             to_planes[0, piece] += level
             to_normal[:, piece] += normal
-            to_planes.index_add_(1, block.texels.source.flatten(), read.flatten(1))
+            for image, part in zip(to_planes, read, strict=True):
+                image.index_add_(0, block.texels.source.flatten(), part.flatten())
             for total, part in zip(to_rest, rest, strict=True):
                 total += part
-        images = [t.view(3, shape[0], *shape[2:]).transpose(0, 1) for t in (to_planes, to_normal)]
+        images = [t.unflatten(1, inputs.valid.shape).transpose(0, 1) for t in (to_planes, to_normal)]
         everything = iter([images[0], None, images[1], *to_rest])
         found = [next(everything) if t is not None else None for t in inputs]
         return [t for t, want in zip(found, needed, strict=True) if want and t is not None]
 
     def push_forward(self, tangents: Sequence[Tensor | None], outputs: Outputs, *tensors: Tensor | None) -> Tensor:
-        inputs = _Inputs(*tensors)  # type: ignore[arg-type]
-        pairs = zip(inputs, tangents, strict=True)
-        filled = [torch.zeros_like(t) if m is None and t is not None else m for t, m in pairs]
-        moved = _Inputs(*filled)  # type: ignore[arg-type]
-        total = torch.zeros_like(inputs.planes[:, 0]).flatten()
+        inputs = _Inputs.of(tensors)
+        pairs = zip(tensors, tangents, strict=True)
+        moved = _Inputs.of([torch.zeros_like(t) if m is None and t is not None else m for t, m in pairs])
+        total = torch.zeros_like(inputs.planes[0])
         for block in self._blocks(inputs):
             piece = slice(block.start, block.stop)
             leaves = block.leaves_of(moved)
             total[piece] += push_forward(block.function, block.leaves, leaves)[0]
             if self.footprint_step > 0:
                 total[piece] += block.by_spread(inputs) * block.push_spread(leaves)
-        return total.view_as(inputs.planes[:, 0])
+        return total.view(inputs.valid.shape)
 
     def _blocks(self, inputs: _Inputs) -> Iterator[_Block]:
-        batch, _, height, width = inputs.planes.shape
-        pixels = batch * height * width
+        pixels = inputs.planes.shape[1]
         budget = BLOCK.get(inputs.planes.device.type, BLOCK["cpu"])
         per_slice = 2 * self.layout.steps
         together = max(1, min(self.layout.slices, budget // (per_slice * min(MIN_PIXELS, pixels))))
@@ -184,7 +189,7 @@ class _Block:
         self, kernel: _Horizon, inputs: _Inputs, start: int, stop: int, slices: range, spread: float = 1.0
     ) -> None:
         self.kernel, self.start, self.stop, self.slices = kernel, start, stop, slices
-        size = (inputs.planes.shape[2], inputs.planes.shape[3])
+        size = (inputs.valid.shape[1], inputs.valid.shape[2])
         self.pixels = taps.make_pixels(start, stop, slices, kernel.layout, size, kernel.rotation, kernel.offset)
         level, normal = self._own(inputs)
         frame = taps.make_frame(level, normal, inputs.intrinsics, inputs.radius, self.pixels, kernel.layout)
@@ -193,11 +198,11 @@ class _Block:
         self.has_thickness = inputs.thickness is not None
 
     def _own(self, inputs: _Inputs) -> tuple[Tensor, Tensor]:
-        planes, normal = (t.transpose(0, 1).flatten(1) for t in (inputs.planes, inputs.normal))
-        return planes[0, self.start : self.stop], normal[:, self.start : self.stop]
+        piece = slice(self.start, self.stop)
+        return inputs.planes[0, piece], inputs.normal[:, piece]
 
     def leaves_of(self, inputs: _Inputs) -> list[Tensor]:
-        read = inputs.planes.transpose(0, 1).flatten(1)[:, self.texels.source]
+        read = torch.stack([plane[self.texels.source] for plane in inputs.planes])
         return [*self._own(inputs), read, *(t for t in inputs[3:] if t is not None)]
 
     def function(self, level: Tensor, normal: Tensor, read: Tensor, *rest: Tensor) -> Outputs:
