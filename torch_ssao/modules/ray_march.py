@@ -28,7 +28,7 @@ class RayMarchedSSAO(AmbientVisibility):
         rays: rays a pixel, >= 1.
         steps: steps a ray, >= 1, uniform.
         thickness: how far solids reach behind their last known surface, of the radius, > 0; None: for ever.
-        gradient: "exact", "surrogate" or "soft"; see `ops.ray_march.ray_march_visibility`. With "exact" the gradient to
+        gradient: "exact", "surrogate" or "soft"; see `ops.ray_march`. With "exact" the gradient to
             thickness is 0.
         surrogate_width: width of the sigmoid of "surrogate" and "soft", of the radius, > 0.
         max_radius_px: longest ray on the screen, in pixels; nearer pixels, where the radius spans more, get the radius

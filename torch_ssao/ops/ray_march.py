@@ -10,6 +10,9 @@ Layers 0, 1, 2, ... are entry, exit, entry, ...: inside is behind an entry and b
 a thickness, no deeper than that behind the entry.
 Steps off the screen or behind the eye never occlude; a ray counts by the share of its steps that fall in the image
 (whatever they meet), and pixels of which nothing was seen are open. Invalid samples are open space.
+Gradients: "exact" - almost everywhere, hits held constant: through Eq. 1 and W. "surrogate" - a hit differentiates as
+sigmoid(depth behind / width) (exits and thickness alike) around the hard value. "soft" - value and gradient of the
+sigmoid form itself, which darkens planes at grazing rays.
 """
 
 from __future__ import annotations
@@ -63,9 +66,7 @@ def ray_march_visibility(
             which the mean does not depend on the number of rays.
         steps: steps a ray, >= 1.
         orthographic: parallel projection along +z.
-        gradient: "exact" - almost everywhere, hits held constant: through Eq. 1 and W. "surrogate" - a hit
-            differentiates as sigmoid(depth behind / width) (and the same for exits and thickness) around the hard
-            value. "soft" - value and gradient of the sigmoid form itself, which darkens planes at grazing rays.
+        gradient: "exact", "surrogate" or "soft", see the module.
         surrogate_width: width of the sigmoid, of the reach, > 0.
     Returns: (B, H, W) in [0, 1]; 1 at invalid pixels.
     Gradients: to points, normal, reach, falloff and (not "exact") thickness; to the camera through points. Forward
