@@ -24,6 +24,7 @@ WIDEST: Final = 0.9  # radius over distance up to which the image of the sphere 
 SMALL: Final = 0.05  # bounds on how much a slice's line approaches or recedes
 HORIZON: Final = 1e-3
 CONNECTED: Final = 3.0
+TRAPEZOID: Final = 6.0
 ROUNDINGS: Final = 4.0
 GRAZE: Final = 1e-3
 
@@ -159,12 +160,12 @@ def merged_length(intervals: list[tuple[float, float]]) -> float:
     return total
 
 
-def connected(tap: Tap, before: Tap | None) -> bool:
+def connected(tap: Tap, before: Tap | None, slope: float) -> bool:
     if not tap.seen or (before is not None and not before.seen):
         return False
     across = tap.along - (before.along if before else 0.0)
     rise = tap.towards - (before.towards if before else 0.0)
-    return across > 0 and abs(rise) <= CONNECTED * across
+    return across > 0 and abs(rise) <= slope * across
 
 
 def side_increments(taps: list[Tap], plane: Slice, side: int, radius: float, s: Settings) -> float:
@@ -179,7 +180,11 @@ def side_increments(taps: list[Tap], plane: Slice, side: int, radius: float, s: 
                 if s.thickness is not None:
                     back = plane.elevation(tap.place + s.thickness * radius * tap.ray, side)
                     start = min(max(start, back), elevation)
-                mean = 0.5 * (earlier + weight) if connected(tap, taps[number - 1] if number else None) else weight
+                mean = (
+                    0.5 * (earlier + weight)
+                    if connected(tap, taps[number - 1] if number else None, TRAPEZOID)
+                    else weight
+                )
                 total += mean * (plane.share_below(elevation, side) - plane.share_below(start, side))
                 horizon = elevation
         earlier = weight
@@ -197,7 +202,7 @@ def side_union(taps: list[Tap], plane: Slice, side: int, radius: float, s: Setti
             ends = [plane.elevation(tap.place + t * tap.ray, side) for t in part]
             arcs.append((ends[1], ends[0]))
         before = taps[number - 1] if number else None
-        if s.connected and connected(tap, before):
+        if s.connected and connected(tap, before, CONNECTED):
             start = plane.point if before is None else before.place
             length = float(np.linalg.norm(tap.place - start))
             ray = (tap.place - start) / length
