@@ -50,6 +50,7 @@ def expected(gb: ts.GBuffer, **options: object) -> torch.Tensor:
         "radius": 0.7, "falloff": 2.5, "thickness": 0.4, "bias": 0.05, "slices": 2, "steps": 3, "step_power": 1.3,
         "weighting": "cosine", "estimator": "bitmask", "connected": False, "max_radius_px": None,
     } | options  # fmt: skip
+    given["extend"] = given.pop("offscreen", "open") == "extend"
     given["cosine"] = given.pop("weighting") == "cosine"
     image = oracle(
         gb.depth[:, 0], gb.valid[:, 0], gb.normal,
@@ -80,7 +81,8 @@ def test_float64_equals_the_oracle(form: dict, weighting: str, make: object, ort
 
 
 @pytest.mark.parametrize(
-    "change", [{"radius": 0.02}, {"radius": 30.0}, {"bias": 0.0}, {"max_radius_px": 2.5}, {"steps": 9}]
+    "change",
+    [{"radius": 0.02}, {"radius": 30.0}, {"bias": 0.0}, {"max_radius_px": 2.5}, {"steps": 9}, {"offscreen": "extend"}],
 )
 def test_float64_equals_the_oracle_elsewhere(change: dict) -> None:
     gb = smooth_gbuffer(height=7, width=12)
@@ -114,5 +116,7 @@ def test_bad_choices() -> None:
     gb = steps_gbuffer()
     with pytest.raises(checks.ChoiceError, match="estimator must be one of"):
         evaluate(gb, estimator="gtao")
+    with pytest.raises(checks.ChoiceError, match="offscreen must be one of"):
+        evaluate(gb, offscreen="clamp")
     with pytest.raises(checks.ChoiceError, match="weighting must be one of"):
         evaluate(gb, weighting="none")

@@ -49,6 +49,7 @@ class Settings:
     estimator: str
     connected: bool
     max_radius_px: float | None
+    extend: bool
     eps: float
 
     def ray(self, u: float, v: float) -> tuple[Floats, Floats]:
@@ -278,6 +279,9 @@ def make_tap(
     reach = shrunk / left
     u, v = centre + shrunk * line
     column, row = math.floor(u), math.floor(v)
+    if s.extend:
+        column = min(max(column, 0), depth.shape[1] - 1)
+        row = min(max(row, 0), depth.shape[0] - 1)
     nothing = Tap(point, view, reach, 0.0, reach, False)
     if not (0 <= column < depth.shape[1] and 0 <= row < depth.shape[0]) or not SMALL < 1 / left < 1 / SMALL:
         return nothing

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch_ssao import checks
 from torch_ssao.camera import Camera
 from torch_ssao.modules.base import AmbientVisibility, ParameterSpec, Positive
-from torch_ssao.ops.horizon import ESTIMATORS, WEIGHTINGS, horizon_obscurance
+from torch_ssao.ops.horizon import ESTIMATORS, OFFSCREEN, WEIGHTINGS, horizon_obscurance
 from torch_ssao.ops.normals import normals_from_points
 from torch_ssao.ops.sampling import tiled_noise
 
@@ -38,6 +38,7 @@ class HBAO(AmbientVisibility):
         connected: estimator "bitmask" also covers the arcs between neighbouring taps of one surface.
         max_radius_px: pixels; where the radius spans more, it is shortened to this, so close surfaces are occluded by their
             surroundings only. None: no limit.
+        offscreen: "open" - what is off the image never occludes; "extend" - the surfaces at the border go on as planes.
         denoise: passes of the edge-aware filter.
         learnable: names of the parameters to register as `nn.Parameter`s, or "all"; the rest are buffers.
     Raises:
@@ -60,6 +61,7 @@ class HBAO(AmbientVisibility):
         "step_power",
         "connected",
         "max_radius_px",
+        "offscreen",
         "denoise",
     )
 
@@ -74,6 +76,7 @@ class HBAO(AmbientVisibility):
     step_power: float
     connected: bool
     max_radius_px: float | None
+    offscreen: str
 
     def __init__(
         self,
@@ -90,6 +93,7 @@ class HBAO(AmbientVisibility):
         step_power: float = 1.3,
         connected: bool = True,
         max_radius_px: float | None = None,
+        offscreen: str = "open",
         denoise: int = 0,
         learnable: str | tuple[str, ...] = (),
     ) -> None:
@@ -101,6 +105,7 @@ class HBAO(AmbientVisibility):
         checks.check_choice("connected", connected, (True, False))
         if max_radius_px is not None:
             checks.check_positive("max_radius_px", max_radius_px)
+        checks.check_choice("offscreen", offscreen, OFFSCREEN)
         checks.check_count("denoise", denoise, 0)
         values = {
             "radius": radius,
@@ -117,6 +122,7 @@ class HBAO(AmbientVisibility):
             "step_power": step_power,
             "connected": connected,
             "max_radius_px": max_radius_px,
+            "offscreen": offscreen,
             "denoise": denoise,
         }
         super().__init__(values, choices, learnable)
@@ -152,5 +158,6 @@ class HBAO(AmbientVisibility):
             estimator=self.estimator,
             connected=self.connected,
             max_radius_px=self.max_radius_px,
+            offscreen=self.offscreen,
         )
         return 1 - obscurance

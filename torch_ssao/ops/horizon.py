@@ -31,6 +31,7 @@ from torch_ssao.ops.recompute import Outputs, pull_back, push_forward, recompute
 BLOCK = {"cpu": 2**18, "cuda": 2**21}  # taps worked on at a time: what fits a cache, what fills a GPU
 ESTIMATORS = ("increments", "bitmask")
 WEIGHTINGS = ("cosine", "uniform")
+OFFSCREEN = ("open", "extend")
 FOOTPRINT_STEP = 0.05  # relative change of the footprint over which its effect is differenced
 MIN_PIXELS = 4096  # of a block, where there are as many: fewer, and the slices are split instead
 
@@ -55,6 +56,7 @@ def horizon_obscurance(
     estimator: str,
     connected: bool = False,
     max_radius_px: float | None = None,
+    offscreen: str = "open",
     footprint_step: float = FOOTPRINT_STEP,
 ) -> Tensor:
     """Obscurance of every pixel from slices of directions through it; the module says how.
@@ -75,6 +77,7 @@ def horizon_obscurance(
         estimator: "increments" or "bitmask".
         connected: "bitmask" also covers the arcs between neighbouring taps of one surface.
         max_radius_px: shortens R where it spans more pixels; None never.
+        offscreen: taps off the image never occlude ("open"), or meet the plane of the nearest pixel ("extend").
         footprint_step: of the footprint, over which its effect is differenced in derivatives.
     Returns: (B, H, W) obscurance in [0, 1].
     Gradients: to depth, normal, intrinsics, radius, falloff, thickness and bias, of the expected estimate (above);
@@ -87,10 +90,11 @@ def horizon_obscurance(
     """
     checks.check_choice("weighting", weighting, WEIGHTINGS)
     checks.check_choice("estimator", estimator, ESTIMATORS)
+    checks.check_choice("offscreen", offscreen, OFFSCREEN)
     known = (torch.isfinite(normal).all(1) & ((normal * normal).sum(1) > 0) & valid)[:, None]
     normal = torch.where(known, normal, normal.new_tensor([0.0, 0.0, -1.0]).view(1, 3, 1, 1))
     planes = taps.surface_planes(depth, valid, intrinsics[:, :2], orthographic=orthographic)
-    layout = taps.Layout(slices, steps, step_power, orthographic, max_radius_px)
+    layout = taps.Layout(slices, steps, step_power, orthographic, max_radius_px, offscreen == "extend")
     kernel = _Horizon(layout, weighting == "cosine", estimator, connected, rotation, offset, footprint_step)
     obscurance = recompute(kernel, planes, valid, normal, intrinsics, radius, falloff, thickness, bias)
     return torch.where(valid, obscurance, 0.0).clamp(0, 1)
@@ -193,7 +197,7 @@ class _Block:
         self.pixels = taps.make_pixels(start, stop, slices, kernel.layout, size, kernel.rotation, kernel.offset)
         level, normal = self._own(inputs)
         frame = taps.make_frame(level, normal, inputs.intrinsics, inputs.radius, self.pixels, kernel.layout)
-        self.texels = taps.find_texels(frame, self.pixels, inputs.valid, spread)
+        self.texels = taps.find_texels(frame, self.pixels, inputs.valid, spread, extend=kernel.layout.extend)
         self.leaves = self.leaves_of(inputs)
         self.has_thickness = inputs.thickness is not None
 

@@ -28,6 +28,7 @@ class Layout(NamedTuple):
     step_power: float
     orthographic: bool
     max_radius_px: float | None
+    extend: bool  # taps off the image read the nearest pixel's plane
 
 
 class Pixels(NamedTuple):
@@ -172,12 +173,12 @@ class Texels(NamedTuple):
     seen: Tensor  # bool: exists and is valid
 
 
-def find_texels(frame: Frame, pixels: Pixels, valid: Tensor, spread: float) -> Texels:
+def find_texels(frame: Frame, pixels: Pixels, valid: Tensor, spread: float, *, extend: bool) -> Texels:
     """Round the taps to whole pixels along the major axis.
 
     Args:
         valid: (B, H, W) bool.
-        spread: factor on the taps' distances.
+        spread: factor on the taps' distances. extend: see `Layout`.
     """
     _, height, width = valid.shape
     longest = frame.radius
@@ -194,6 +195,8 @@ def find_texels(frame: Frame, pixels: Pixels, valid: Tensor, spread: float) -> T
     _, offset_x, offset_y, away = _place(frame, count)
     column = (pixels.column + 0.5 + offset_x).floor()
     row = (pixels.row + 0.5 + offset_y).floor()
+    if extend:
+        column, row = column.clamp(0, width - 1), row.clamp(0, height - 1)
     seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     if away is not None:
         seen = seen & (away > NEAREST) & (away < 1 / NEAREST)
