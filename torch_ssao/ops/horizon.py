@@ -91,13 +91,17 @@ def horizon_obscurance(
     checks.check_choice("weighting", weighting, WEIGHTINGS)
     checks.check_choice("estimator", estimator, ESTIMATORS)
     checks.check_choice("offscreen", offscreen, OFFSCREEN)
-    known = (torch.isfinite(normal).all(1) & ((normal * normal).sum(1) > 0) & valid)[:, None]
-    normal = torch.where(known, normal, normal.new_tensor([0.0, 0.0, -1.0]).view(1, 3, 1, 1))
+    normal = _usable(normal, valid)
     planes = taps.surface_planes(depth, valid, intrinsics[:, :2], orthographic=orthographic)
     layout = taps.Layout(slices, steps, step_power, orthographic, max_radius_px, offscreen == "extend")
     kernel = _Horizon(layout, weighting == "cosine", estimator, connected, rotation, offset, footprint_step)
     obscurance = recompute(kernel, planes, valid, normal, intrinsics, radius, falloff, thickness, bias)
     return torch.where(valid, obscurance, 0.0).clamp(0, 1)
+
+
+def _usable(normal: Tensor, valid: Tensor) -> Tensor:
+    known = (torch.isfinite(normal).all(1) & ((normal * normal).sum(1) > 0) & valid)[:, None]
+    return torch.where(known, normal, normal.new_tensor([0.0, 0.0, -1.0]).view(1, 3, 1, 1))
 
 
 class _Inputs(NamedTuple):
