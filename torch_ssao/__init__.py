@@ -10,6 +10,8 @@ from torch_ssao.camera import Camera as Camera
 from torch_ssao.camera import look_at as look_at
 from torch_ssao.gbuffer import GBuffer as GBuffer
 from torch_ssao.gbuffer import collate as collate
+from torch_ssao.modules import HBAO as HBAO
+from torch_ssao.modules import RayMarchedSSAO as RayMarchedSSAO
 from torch_ssao.modules import StatVO as StatVO
 from torch_ssao.projection import depth_from_zbuffer as depth_from_zbuffer
 from torch_ssao.projection import opengl_to_view as opengl_to_view

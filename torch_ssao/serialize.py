@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -34,16 +35,17 @@ def save(module: AmbientVisibility, path: str | Path) -> None:
         raise ModuleFileError(
             f"module must be one of {', '.join(TECHNIQUES)}, got {type(module).__name__}: save its state_dict instead"
         )
-    raw = {name: getattr(module, f"raw_{name}").detach() for name in module.PARAMETERS}
+    values = module.values()
+    raw = {name: float(getattr(module, f"raw_{name}").detach()) for name in values}
     record = {
         "format": FORMAT,
         "version": VERSION,
         "technique": names[type(module)],
         "choices": module.config(),
         "learnable": list(module.learnable),
-        "values": module.values(),
-        "raw": {name: tensor.item() for name, tensor in raw.items()},
-        "dtype": str(raw["radius"].dtype).removeprefix("torch."),
+        "values": {name: values.get(name) for name in module.PARAMETERS},  # None is off
+        "raw": {name: number for name, number in raw.items() if math.isfinite(number)},  # 0 is exact without
+        "dtype": str(module.radius.dtype).removeprefix("torch."),
     }
     path = Path(path)
     checks.check_output_folder("path", path.parent)
@@ -67,8 +69,8 @@ def load(path: str | Path) -> AmbientVisibility:
         module = kind(**record["values"], **record["choices"], learnable=tuple(record["learnable"]))
         module = module.to(getattr(torch, record["dtype"]))
         with torch.no_grad():
-            for name in module.PARAMETERS:
-                getattr(module, f"raw_{name}").fill_(record["raw"][name])
+            for name, number in record["raw"].items():
+                getattr(module, f"raw_{name}").fill_(number)
     except (KeyError, TypeError, AttributeError) as error:
         raise ModuleFileError(f"path {str(path)!r} lacks or has a wrong {error}: save the module again") from error
     return module

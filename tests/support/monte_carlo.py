@@ -1,4 +1,4 @@
-"""Quasi-Monte Carlo visibility by casting rays against plain planes and spheres; shares no code with the package."""
+"""Quasi-Monte Carlo visibility by casting rays against planes, spheres and cylinders; shares no code with the package."""
 
 from __future__ import annotations
 
@@ -52,6 +52,28 @@ def sphere(centre: Sequence[float], radius: float) -> Occluder:
     return cast
 
 
+def shell(
+    centre: Sequence[float], radius: float, inside: Callable[[Array], Array], axis: Sequence[float] | None = None
+) -> Occluder:
+    """Both sides of a sphere, or with an axis of a cylinder, where `inside` accepts the hit points (N, 3)."""
+    flat = np.eye(3) if axis is None else np.eye(3) - np.outer(axis, axis)
+
+    def cast(origin: Array, directions: Array) -> Array:
+        offset, across = flat @ np.subtract(origin, centre), directions @ flat
+        square = np.maximum((across**2).sum(axis=1), 1e-300)
+        half_b = across @ offset
+        inner = half_b**2 - square * (offset @ offset - radius**2)
+        root = np.sqrt(np.maximum(inner, 0.0))
+        nearest = np.full(len(directions), np.inf)
+        for distance in ((-half_b + root) / square, (-half_b - root) / square):
+            good = (inner > 0) & (distance > 1e-9) & (distance < 1e12)
+            hit = origin + np.where(good, distance, 0.0)[:, None] * directions
+            nearest = np.where(good & inside(hit), distance, nearest)  # the nearer one comes last
+        return nearest
+
+    return cast
+
+
 def visibility(
     origin: Sequence[float],
     normal: Sequence[float],
@@ -64,9 +86,27 @@ def visibility(
     log2_rays: int = LOG2_RAYS,
 ) -> float:
     """Visibility 1 - mean W(distance / radius) of the nearest hits of all rays."""
+    distance = distances(origin, normal, occluders, weighting=weighting, seed=seed, log2_rays=log2_rays)
+    return attenuated(distance, radius, falloff)
+
+
+def distances(
+    origin: Sequence[float],
+    normal: Sequence[float],
+    occluders: Sequence[Occluder],
+    *,
+    weighting: str = "cosine",
+    seed: int = 0,
+    log2_rays: int = LOG2_RAYS,
+) -> Array:
+    """Distances (N,) to the nearest hits of all rays, to be attenuated by several radii and falloffs."""
     directions = hemisphere(normal, weighting, seed, log2_rays)
     start = np.asarray(origin, np.float64)
-    distance = np.min([cast(start, directions) for cast in occluders], axis=0)
+    return np.min([cast(start, directions) for cast in occluders], axis=0)
+
+
+def attenuated(distance: Array, radius: float, falloff: str) -> float:
+    """Visibility 1 - mean W(distance / radius)."""
     t = np.where(np.isfinite(distance), distance, 0.0) / radius
     weight = {"binary": np.ones_like(t), "linear": 1.0 - t, "quadratic": 1.0 - t**2}[falloff]
     return float(1.0 - np.where(np.isfinite(distance) & (t < 1), weight, 0.0).mean())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -14,17 +15,21 @@ from torch.utils import _pytree as pytree
 from torch_ssao import checks
 from torch_ssao.camera import Camera
 from torch_ssao.gbuffer import GBuffer
+from torch_ssao.ops.denoise import denoise_visibility
 from torch_ssao.ops.falloff import contrast_power
+from torch_ssao.ops.normals import normals_from_points
 
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """A positive continuous parameter: its meaning and the range a fit searches.
+    """A continuous parameter: its meaning and the range a fit searches. Positive, unless it says otherwise.
 
     Args:
-        unit: "scene units" or "of the radius" or "1".
+        unit: "scene units" or "of the radius" or "degrees" or "1".
         low, high: fit bounds; for the radius they multiply the starting value, for all others they are absolute.
         relative_bounds: whether low and high multiply the starting value.
+        optional: whether it may be None, which switches off what it controls.
+        may_be_zero: whether it may be 0. A parameter at 0 or None is not in use: nothing moves it from there.
         meaning: one line for tables and error messages.
     """
 
@@ -33,10 +38,12 @@ class ParameterSpec:
     high: float
     meaning: str
     relative_bounds: bool = False
+    optional: bool = False
+    may_be_zero: bool = False
 
 
 class Positive:
-    """Property over the unconstrained storage `raw_<name>`: the parameter is exp(raw)."""
+    """Property over the unconstrained storage `raw_<name>`: the parameter is exp(raw), None where raw is None."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
@@ -44,13 +51,21 @@ class Positive:
     def __get__(self, module: nn.Module | None, owner: type | None = None) -> Any:
         if module is None:
             return self
-        return getattr(module, f"raw_{self.name}").exp()
-
-    def __set__(self, module: nn.Module, value: float | Tensor) -> None:
-        checks.check_positive(self.name, value.detach() if isinstance(value, Tensor) else value)
         raw = getattr(module, f"raw_{self.name}")
-        with torch.no_grad():
-            raw.copy_(torch.as_tensor(value, dtype=torch.float64).log())
+        return None if raw is None else raw.exp()
+
+    def __set__(self, module: AmbientVisibility, value: float | Tensor | None) -> None:
+        plain = value.detach() if isinstance(value, Tensor) else value
+        module.check_value(self.name, plain)
+        raw = getattr(module, f"raw_{self.name}")
+        if plain is not None and raw is not None:
+            with torch.no_grad():
+                raw.copy_(torch.as_tensor(plain, dtype=torch.float64).log())
+        elif plain is None and raw is not None:
+            setattr(module, f"raw_{self.name}", None)
+        elif plain is not None:
+            like: Tensor = module.radius
+            setattr(module, f"raw_{self.name}", torch.as_tensor(plain, dtype=torch.float64).log().to(like))
 
 
 class AmbientVisibility(nn.Module, abc.ABC):
@@ -63,21 +78,26 @@ class AmbientVisibility(nn.Module, abc.ABC):
     PARAMETERS: ClassVar[dict[str, ParameterSpec]]
     CHOICES: ClassVar[tuple[str, ...]]  # discrete configuration, plain attributes
 
+    radius = Positive()
     contrast = Positive()
+    denoise: int = 0  # passes of the edge-aware filter; techniques without noise have none
 
-    def __init__(self, values: dict[str, float], choices: dict[str, Any], learnable: str | tuple[str, ...]) -> None:
+    def __init__(
+        self, values: Mapping[str, float | None], choices: dict[str, Any], learnable: str | tuple[str, ...]
+    ) -> None:
         super().__init__()
         for name, value in choices.items():
             setattr(self, name, value)
-        self.learnable = self._resolve_learnable(learnable)
+        self.learnable: tuple[str, ...] = ()
         for name in self.PARAMETERS:
             value = values[name]
-            checks.check_positive(name, value.detach() if isinstance(value, Tensor) else value)
-            raw = torch.tensor(math.log(float(value)), dtype=torch.get_default_dtype())
-            if name in self.learnable:
-                self.register_parameter(f"raw_{name}", nn.Parameter(raw))
-            else:
-                self.register_buffer(f"raw_{name}", raw)
+            self.check_value(name, value.detach() if isinstance(value, Tensor) else value)
+            raw = None if value is None else torch.tensor(_log(float(value)), dtype=torch.get_default_dtype())
+            self.register_buffer(f"raw_{name}", raw)
+        self.learnable = self._resolve_learnable(learnable)
+        for name in self.learnable:
+            raw = self._buffers.pop(f"raw_{name}")
+            self.register_parameter(f"raw_{name}", nn.Parameter(raw))  # type: ignore[arg-type]
 
     @abc.abstractmethod
     def _visibility(
@@ -89,13 +109,36 @@ class AmbientVisibility(nn.Module, abc.ABC):
         invalid pixels is ignored.
         """
 
-    @abc.abstractmethod
     def used_parameters(self) -> tuple[str, ...]:
         """Names of the continuous parameters that this configuration uses, in the order of `PARAMETERS`."""
+        unused = self._unused_parameters()
+        return tuple(name for name in self.PARAMETERS if name not in unused and self._is_on(name))
+
+    def _unused_parameters(self) -> tuple[str, ...]:
+        """Parameters that the discrete choices leave without effect."""
+        return ()
+
+    def _is_on(self, name: str) -> bool:
+        raw = getattr(self, f"raw_{name}")
+        return raw is not None and not bool(torch.isneginf(raw.detach()))
+
+    def check_value(self, name: str, value: float | Tensor | None) -> None:
+        """Raise `RangeError` unless `value` is one that the parameter may take."""
+        spec = self.PARAMETERS[name]
+        off = value is None or (spec.may_be_zero and bool(value == 0))
+        if off and name in self.learnable:
+            raise checks.RangeError(
+                f"{name} must stay above 0 while it is learnable, got {value}: leave it out of learnable"
+            )
+        if value is None and not spec.optional:
+            raise checks.RangeError(f"{name} must be a number, got None: pass a positive {name}")
+        if not off:
+            checks.check_positive(name, value)  # type: ignore[arg-type]
 
     def values(self) -> dict[str, float]:
-        """The continuous parameters as plain numbers, by name."""
-        return {name: float(getattr(self, name).detach()) for name in self.PARAMETERS}
+        """The continuous parameters as plain numbers, by name; those that are None are left out."""
+        named = {name: getattr(self, name) for name in self.PARAMETERS}
+        return {name: float(value.detach()) for name, value in named.items() if value is not None}
 
     def config(self) -> dict[str, Any]:
         """The discrete choices, by name."""
@@ -122,11 +165,24 @@ class AmbientVisibility(nn.Module, abc.ABC):
             depth = _wide(torch.where(valid, gbuffer.depth, 1.0))
             normal = None if gbuffer.normal is None else _wide(torch.where(valid[:, :1], gbuffer.normal, 0.0))
             visibility = self._visibility(depth, valid, normal, gbuffer.camera, frame=frame, backend=backend)
+            if self.denoise:
+                visibility = self._denoised(visibility, depth, valid, normal, gbuffer.camera)
             visibility = contrast_power(visibility, self.contrast.to(visibility.dtype))
             return torch.where(valid[:, :1], visibility[:, None], 1.0)
 
+    def _denoised(
+        self, visibility: Tensor, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera
+    ) -> Tensor:
+        """`denoise` passes of the edge-aware filter over the visibility (B, H, W)."""
+        points = camera.unproject(depth[:, :1])[:, :, 0]
+        if normal is None:
+            normal = normals_from_points(points, valid[:, 0])
+        radius = self.radius.to(depth.dtype).expand(depth.shape[0])
+        return denoise_visibility(visibility, points, normal, valid[:, 0], radius, passes=self.denoise)
+
     def extra_repr(self) -> str:
-        values = [f"{name}={value:.6g}" for name, value in self.values().items()]
+        off = {name: None for name in self.PARAMETERS if getattr(self, name) is None}
+        values = [f"{name}={value:.6g}" for name, value in self.values().items()] + [f"{name}=None" for name in off]
         choices = [f"{name}={value!r}" for name, value in self.config().items()]
         return ", ".join([*values, *choices, f"learnable={self.learnable!r}"])
 
@@ -138,6 +194,10 @@ class AmbientVisibility(nn.Module, abc.ABC):
         for name in names:
             checks.check_choice("learnable", name, used)
         return tuple(name for name in used if name in names)
+
+
+def _log(value: float) -> float:
+    return math.log(value) if value > 0 else -math.inf  # exp brings 0 back
 
 
 def _wide(tensor: Tensor) -> Tensor:

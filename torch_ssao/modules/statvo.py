@@ -84,9 +84,6 @@ class StatVO(AmbientVisibility):
         }
         super().__init__(values, choices, learnable)
 
-    def used_parameters(self) -> tuple[str, ...]:
-        return tuple(self.PARAMETERS)
-
     def _visibility(
         self, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera, *, frame: int, backend: str
     ) -> Tensor:

@@ -1,4 +1,4 @@
-"""The shared response curves: StatVO's psi and the contrast power."""
+"""The shared response curves: the attenuation with distance, StatVO's psi and the contrast power."""
 
 from __future__ import annotations
 
@@ -8,6 +8,27 @@ import torch
 from torch import Tensor
 
 CONTRAST_FLOOR = 1e-3  # visibility is clamped to this inside the derivative of A^alpha (infinite at 0 for alpha < 1)
+
+DISTANCE_FLOOR = 1e-3  # t is clamped to this inside the derivative of t^p to t (infinite at 0 for p < 1)
+
+
+def attenuation(t: Tensor, power: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """How much an occluder at a distance counts, and the two derivatives: W_p(t) = 1 - t^p for t < 1, else 0.
+
+    Args:
+        t: distance as a fraction of the radius, >= 0, any shape; inf is allowed.
+        power: p > 0, broadcastable to t; 1 is linear, 2 is HBAO's, a large p approaches the binary hit.
+    Returns: W, d W / d t, d W / d power, each of the shape of t.
+    Gradients: by the returned derivatives, 0 from t = 1 on; for p < 1, t is clamped to `DISTANCE_FLOOR` inside d W / d t.
+    Source: ray-marched SSAO paper (p = 1), HBAO (p = 2).
+    """
+    near = t < 1
+    inside = torch.where(near, t, 1.0)
+    raised = inside**power
+    floor = torch.where(power < 1, DISTANCE_FLOOR, 0.0)
+    to_t = torch.where(near, -power * torch.maximum(inside, floor.to(t.dtype)) ** (power - 1), 0.0)
+    to_power = -raised * inside.clamp(min=torch.finfo(t.dtype).tiny).log()
+    return 1 - raised, to_t, to_power
 
 
 def psi(s: Tensor, slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,8 +1,9 @@
-"""Plane patches and spheres: ray intersection, normals, distances and triangles, in float64 world space."""
+"""Plane patches, disks, spheres and cylinders: ray intersection, normals, distances and triangles, in float64 world space."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
@@ -86,29 +87,78 @@ class Patch:
 
 @final
 @dataclass(frozen=True)
+class Annulus:
+    """A horizontal ring, a disk (inner 0) or a plane with a round hole (outer inf); seen from both sides.
+
+    Args:
+        centre: world-space point.
+        inner, outer: radii, 0 <= inner < outer, scene units.
+    """
+
+    centre: Vector
+    inner: float
+    outer: float
+
+    def hit(self, origin: Tensor, direction: Tensor, start: float = 0.0) -> Tensor:
+        """Ray parameter of the hit beyond `start`, inf for none; arguments as `Patch.hit`."""
+        to_centre = origin.new_tensor(self.centre) - origin
+        t = to_centre[..., 2] / direction[..., 2]
+        lateral = torch.linalg.vector_norm((t[..., None] * direction - to_centre)[..., :2], dim=-1)
+        slack = _EDGE * (1.0 + origin.abs().amax(-1) + t.abs())
+        inside = torch.isfinite(t) & (t > start) & (lateral >= self.inner - slack) & (lateral <= self.outer + slack)
+        return torch.where(inside, t, torch.inf)
+
+    def normal_at(self, points: Tensor) -> Tensor:
+        """Unit normals (..., 3), upwards, at points (..., 3)."""
+        return points.new_tensor((0.0, 0.0, 1.0)).expand_as(points)
+
+    def distance(self, points: Tensor) -> Tensor:
+        """Distances (...,) from points (..., 3) to the ring."""
+        place = points - points.new_tensor(self.centre)
+        lateral = torch.linalg.vector_norm(place[..., :2], dim=-1)
+        return torch.hypot(lateral - lateral.clamp(self.inner, self.outer), place[..., 2])
+
+    def mesh(self, centre: Array, extent: float, segments: int) -> tuple[Array, NDArray[np.int64]]:
+        """Sectors between the circles, the outer one at least `extent` from `centre`; see `AnalyticScene.mesh`."""
+        middle = np.asarray(self.centre)
+        outer = self.outer
+        if math.isinf(outer):
+            outer = (extent + float(np.linalg.norm((centre - middle)[:2]))) / math.cos(math.pi / segments)
+        circle = _circle(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), segments)
+        here, there = np.arange(segments), (np.arange(segments) + 1) % segments
+        if self.inner == 0.0:
+            points = np.concatenate(([middle], middle + outer * circle))
+            return points, np.stack((0 * here, 1 + here, 1 + there), axis=1).astype(np.int64)
+        points = np.concatenate((middle + outer * circle, middle + self.inner * circle))
+        return points, _band(segments + here, segments + there, here, there)
+
+
+@final
+@dataclass(frozen=True)
 class Sphere:
-    """A sphere; normals point outwards.
+    """A sphere, or what of it lies between two heights; normals point outwards.
 
     Args:
         centre: world-space point.
         radius: > 0, scene units.
+        z_range: (low, high) world-space heights of the part kept, scene units; all by default.
     """
 
     centre: Vector
     radius: float
+    z_range: tuple[float, float] = (-math.inf, math.inf)
 
     def hit(self, origin: Tensor, direction: Tensor, start: float = 0.0) -> Tensor:
         """Ray parameter of the nearest hit beyond `start`, inf for none; arguments as `Patch.hit`."""
         offset = origin - origin.new_tensor(self.centre)
-        square = (direction * direction).sum(-1)
-        closest = -(offset * direction).sum(-1) / square
-        # The distance of the ray from the centre keeps its digits where the usual discriminant cancels.
-        miss = offset + closest[..., None] * direction
-        inner = self.radius**2 - (miss * miss).sum(-1)
-        half = torch.sqrt(inner.clamp_min(0.0) / square)
-        near, far = closest - half, closest + half
-        t = torch.where(near > start, near, far)
-        return torch.where((inner >= 0) & (t > start), t, torch.inf)
+        closest, half, inner = _chord(offset, direction, self.radius)
+
+        def kept(t: Tensor) -> Tensor:
+            height = origin[..., 2] + t * direction[..., 2]
+            slack = _EDGE * (1.0 + origin.abs().amax(-1) + t.abs())
+            return (t > start) & (height >= self.z_range[0] - slack) & (height <= self.z_range[1] + slack)
+
+        return _nearest(closest, half, inner, kept)
 
     def normal_at(self, points: Tensor) -> Tensor:
         """Unit outward normals (..., 3) at points (..., 3)."""
@@ -116,27 +166,127 @@ class Sphere:
 
     def distance(self, points: Tensor) -> Tensor:
         """Distances (...,) from points (..., 3) to the surface."""
-        return (torch.linalg.vector_norm(points - points.new_tensor(self.centre), dim=-1) - self.radius).abs()
+        offset = points - points.new_tensor(self.centre)
+        first, last = self._polar_range()
+        if (first, last) == (0.0, math.pi):
+            return (torch.linalg.vector_norm(offset, dim=-1) - self.radius).abs()
+        lateral, height = torch.linalg.vector_norm(offset[..., :2], dim=-1), offset[..., 2]
+        polar = torch.atan2(lateral, height)
+        nearest = polar.clamp(first, last)
+        on_rim = torch.hypot(lateral - self.radius * nearest.sin(), height - self.radius * nearest.cos())
+        return torch.where(polar == nearest, (torch.hypot(lateral, height) - self.radius).abs(), on_rim)
 
     def mesh(self, centre: Array, extent: float, segments: int) -> tuple[Array, NDArray[np.int64]]:
         """Latitudes and longitudes, `segments` around the equator; see `AnalyticScene.mesh`."""
-        rings = max(4, segments // 2)
-        polar = np.pi * np.arange(1, rings) / rings
-        turn = 2.0 * np.pi * np.arange(segments) / segments
-        ring = np.stack(
-            (
-                np.outer(np.sin(polar), np.cos(turn)),
-                np.outer(np.sin(polar), np.sin(turn)),
-                np.outer(np.cos(polar), np.ones(segments)),
-            ),
-            axis=-1,
-        ).reshape(-1, 3)
-        unit = np.concatenate(([[0.0, 0.0, 1.0]], ring, [[0.0, 0.0, -1.0]]))
-        row = 1 + segments * np.arange(rings - 1)[:, None]
+        first, last = self._polar_range()
+        rings = max(4, math.ceil(segments * (last - first) / (2.0 * math.pi)))
+        polar = first + (last - first) * np.arange(int(first == 0.0), rings + int(last < math.pi)) / rings
+        circle = _circle(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), segments)
+        up = np.array([0.0, 0.0, 1.0])
+        unit = (np.sin(polar)[:, None, None] * circle + np.cos(polar)[:, None, None] * up).reshape(-1, 3)
         here, there = np.arange(segments), (np.arange(segments) + 1) % segments
-        north = np.stack((np.zeros(segments, np.int64), 1 + here, 1 + there), axis=1)
-        south = np.stack((np.full(segments, len(unit) - 1), row[-1] + there, row[-1] + here), axis=1)
-        a, b, c, d = (row[:-1] + here, row[1:] + here, row[1:] + there, row[:-1] + there)
-        sides = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
-        faces = np.concatenate((north, sides, south)).astype(np.int64)
-        return np.asarray(self.centre) + self.radius * unit, faces
+        row = segments * np.arange(len(polar))[:, None]
+        faces = [_band(row[:-1] + here, row[:-1] + there, row[1:] + here, row[1:] + there)]
+        for pole, at_pole, ends in ((up, first == 0.0, (here, there)), (-up, last == math.pi, (there, here))):
+            if at_pole:
+                rim = 0 if pole[2] > 0 else row[-1]
+                faces.append(np.stack((np.full(segments, len(unit)), rim + ends[0], rim + ends[1]), axis=1))
+                unit = np.concatenate((unit, [pole]))
+        return np.asarray(self.centre) + self.radius * unit, np.concatenate(faces).astype(np.int64)
+
+    def _polar_range(self) -> tuple[float, float]:
+        """Polar angles of the upper and the lower rim, 0 and pi at a pole."""
+        low, high = (min(max((z - self.centre[2]) / self.radius, -1.0), 1.0) for z in self.z_range)
+        return math.acos(high), math.acos(low)
+
+
+@final
+@dataclass(frozen=True)
+class Cylinder:
+    """The side of a cylinder, finite or not; normals point away from the axis.
+
+    Args:
+        origin: world-space point on the axis.
+        axis: unit direction.
+        radius: > 0, scene units.
+        reach: (low, high) along the axis from the origin, infinite by default.
+    """
+
+    origin: Vector
+    axis: Vector
+    radius: float
+    reach: tuple[float, float] = (-math.inf, math.inf)
+
+    def hit(self, origin: Tensor, direction: Tensor, start: float = 0.0) -> Tensor:
+        """Ray parameter of the nearest hit beyond `start`, inf for none; arguments as `Patch.hit`."""
+        axis, offset = origin.new_tensor(self.axis), origin - origin.new_tensor(self.origin)
+        along_origin, along_ray = (offset * axis).sum(-1), (direction * axis).sum(-1)
+        across = direction - along_ray[..., None] * axis
+        closest, half, inner = _chord(offset - along_origin[..., None] * axis, across, self.radius)
+
+        def kept(t: Tensor) -> Tensor:
+            along = along_origin + t * along_ray
+            slack = _EDGE * (1.0 + origin.abs().amax(-1) + t.abs())
+            return (t > start) & (along >= self.reach[0] - slack) & (along <= self.reach[1] + slack)
+
+        return _nearest(closest, half, inner, kept)
+
+    def normal_at(self, points: Tensor) -> Tensor:
+        """Unit outward normals (..., 3) at points (..., 3)."""
+        axis, offset = points.new_tensor(self.axis), points - points.new_tensor(self.origin)
+        return torch.nn.functional.normalize(offset - (offset * axis).sum(-1, keepdim=True) * axis, dim=-1)
+
+    def distance(self, points: Tensor) -> Tensor:
+        """Distances (...,) from points (..., 3) to the surface."""
+        axis, offset = points.new_tensor(self.axis), points - points.new_tensor(self.origin)
+        along = (offset * axis).sum(-1)
+        lateral = torch.linalg.vector_norm(offset - along[..., None] * axis, dim=-1)
+        return torch.hypot(lateral - self.radius, along - along.clamp(*self.reach))
+
+    def mesh(self, centre: Array, extent: float, segments: int) -> tuple[Array, NDArray[np.int64]]:
+        """`segments` strips, cut at `extent` from `centre`; see `AnalyticScene.mesh`."""
+        axis, origin = np.asarray(self.axis, np.float64), np.asarray(self.origin, np.float64)
+        middle = min(max(float((centre - origin) @ axis), self.reach[0]), self.reach[1])
+        low, high = (
+            end if math.isfinite(end) else middle + sign * extent for end, sign in zip(self.reach, (-1, 1), strict=True)
+        )
+        first = np.eye(3)[np.argmin(np.abs(axis))]
+        first = first - (first @ axis) * axis
+        first = first / np.linalg.norm(first)
+        circle = self.radius * _circle(first, np.cross(axis, first), segments)
+        here, there = np.arange(segments), (np.arange(segments) + 1) % segments
+        points = np.concatenate((origin + high * axis + circle, origin + low * axis + circle))
+        return points, _band(here, there, segments + here, segments + there)
+
+
+Surface = Patch | Annulus | Sphere | Cylinder
+
+
+def _chord(offset: Tensor, direction: Tensor, radius: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Middle and half-length (in ray parameters) of a ray's chord in a ball; the last is < 0 where it misses.
+
+    The distance of the ray from the centre keeps its digits where the usual discriminant cancels.
+    """
+    square = (direction * direction).sum(-1)
+    closest = -(offset * direction).sum(-1) / square
+    miss = offset + closest[..., None] * direction
+    inner = radius**2 - (miss * miss).sum(-1)
+    return closest, torch.sqrt(inner.clamp_min(0.0) / square), inner
+
+
+def _nearest(closest: Tensor, half: Tensor, inner: Tensor, kept: Callable[[Tensor], Tensor]) -> Tensor:
+    """The first end of a chord that is kept, inf for none."""
+    near, far = closest - half, closest + half
+    found = torch.where(kept(near), near, torch.where(kept(far), far, torch.inf))
+    return torch.where(inner >= 0, found, torch.inf)  # a ray along the axis of a cylinder gives NaN: no hit
+
+
+def _circle(first: Array, second: Array, segments: int) -> Array:
+    """(segments, 3) points of the unit circle that `first` and `second` span."""
+    turn = 2.0 * np.pi * np.arange(segments) / segments
+    return np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
+
+
+def _band(a: NDArray[np.int64], b: NDArray[np.int64], c: NDArray[np.int64], d: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Two triangles for each quadrilateral of the upper edge a b and the lower edge c d."""
+    return np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, c, d), (a, d, b))]).astype(np.int64)

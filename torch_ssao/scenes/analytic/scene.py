@@ -1,14 +1,10 @@
-"""Scenes of planes and spheres whose G-buffers and visibility are exact: test suite, benchmark and calibration in one.
-
-World space has z up; the floor is z = 0, walls stand on the y axis and look along +x.
-"""
+"""The record of an analytic scene: surfaces, the closed form of each, cameras, G-buffers, meshes."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import TypedDict, final
 
 import numpy as np
@@ -20,7 +16,7 @@ from torch_ssao import checks
 from torch_ssao.camera import Camera, look_at
 from torch_ssao.gbuffer import GBuffer
 from torch_ssao.scenes import closed_forms
-from torch_ssao.scenes.primitives import Array, Patch, Sphere
+from torch_ssao.scenes.primitives import Array, Surface
 
 _FAR = 1e4  # in spans: what lies deeper is background, so that rays along a plane's horizon do not reach 1e16
 _ON_SURFACE = 1e-4  # of the depth: a float32 depth, or a finely tessellated sphere, still counts as on its surface
@@ -46,7 +42,7 @@ ClosedForm = Callable[[Array, Array, Question], Array]
 @final
 @dataclass(frozen=True, eq=False)
 class AnalyticScene:
-    """Planes and spheres with the exact visibility of every point on them; made by the builders of this module.
+    """Simple surfaces with the exact visibility of the points on them; made by the builders of this package.
 
     Args:
         name: of the builder.
@@ -57,7 +53,7 @@ class AnalyticScene:
     """
 
     name: str
-    surfaces: tuple[Patch | Sphere, ...]
+    surfaces: tuple[Surface, ...]
     exact_forms: tuple[ClosedForm, ...]
     focus: tuple[float, float, float]
     span: float
@@ -155,7 +151,7 @@ class AnalyticScene:
             closed form holds.
         Raises: RangeError, ChoiceError.
         Gradients: none.
-        Cost: about 0.5 us a pixel on one core, 3 us where a falloff is integrated numerically.
+        Cost: about 0.5 us a pixel on one core, 1 to 10 us where a form is integrated numerically.
         """
         closed_forms.check_question(radius, falloff, weighting)
         question = Question(radius=radius, falloff=falloff, weighting=weighting)
@@ -186,7 +182,7 @@ class AnalyticScene:
         Args:
             extent: > 0, scene units; infinite surfaces are cut at this distance from the focus, so pixels whose sphere
                 of radius R stays within it have the visibility that `exact` gives.
-            segments: around a sphere's equator; its error in visibility is about (pi / segments)^2.
+            segments: around a sphere or a circle; its error in visibility is about (pi / segments)^2.
         Returns: vertices (V, 3) float64 in world space; faces (F, 3) int64, counter-clockwise about the normals.
         Raises: RangeError.
         """
@@ -213,143 +209,6 @@ class AnalyticScene:
             normal = torch.where((index == number)[..., None], surface.normal_at(points), normal)
         away = (normal * direction).sum(dim=-1, keepdim=True) > 0
         return torch.where(away, -normal, normal)
-
-
-def plane() -> AnalyticScene:
-    """The infinite floor alone: visibility 1."""
-    return AnalyticScene("plane", (_floor(),), (_always_open,), (0.5, 0.0, 0.0), 2.0)
-
-
-def wall() -> AnalyticScene:
-    """A floor and an infinite wall at right angles: `closed_forms.wall` on both."""
-    return AnalyticScene("wall", *_wedge(90.0), focus=(0.5, 0.0, 0.0), span=2.0)
-
-
-def dihedral(angle_deg: float) -> AnalyticScene:
-    """Two half-planes that share the y axis: `closed_forms.dihedral` on both, inside and outside.
-
-    Args:
-        angle_deg: interior angle, in (0, 360); above 180 the edge is convex.
-    Raises: RangeError.
-    """
-    closed_forms.dihedral(1.0, angle_deg)  # one range check for both
-    return AnalyticScene("dihedral", *_wedge(angle_deg), focus=(0.5, 0.0, 0.0), span=2.0)
-
-
-def finite_wall(height: float) -> AnalyticScene:
-    """A thin, infinitely long wall of finite height: `closed_forms.finite_wall` on the floor, `wall` on the wall.
-
-    Args:
-        height: > 0, scene units.
-    Raises: RangeError.
-    """
-    checks.check_positive("height", height)
-    return _slat("finite_wall", 0.0, height)
-
-
-def raised_slat(gap: float, height: float) -> AnalyticScene:
-    """A thin wall that begins at a height above the floor: `closed_forms.raised_slat` on the floor, `wall` on the slat.
-
-    Args:
-        gap: > 0, scene units below the slat; height: > 0, of the slat itself.
-    Raises: RangeError.
-    """
-    checks.check_positive("gap", gap)
-    checks.check_positive("height", height)
-    return _slat("raised_slat", gap, height)
-
-
-def ceiling(height: float) -> AnalyticScene:
-    """A floor under an infinite parallel plate: `closed_forms.ceiling` on both.
-
-    Args:
-        height: > 0, of the plate, scene units.
-    Raises: RangeError.
-    """
-    checks.check_positive("height", height)
-    plate = Patch((0.0, 0.0, height), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))
-    inside = (partial(_between_plates, height=height, up=1.0), partial(_between_plates, height=height, up=-1.0))
-    return AnalyticScene("ceiling", (_floor(), plate), inside, (0.0, 0.0, 0.0), 2.0 * height)
-
-
-def sphere_on_plane(radius: float) -> AnalyticScene:
-    """A sphere that rests on the floor at the origin: `closed_forms.sphere_on_plane`, and `half_space` on the sphere.
-
-    Args:
-        radius: > 0, of the sphere, scene units.
-    Raises: RangeError.
-    """
-    checks.check_positive("radius", radius)
-    form = partial(_floor_under, form=_beside_sphere, sizes=(radius,))
-    surfaces = (_floor(), Sphere((0.0, 0.0, radius), radius))
-    on_ball = partial(_on_sphere, sphere_radius=radius)
-    return AnalyticScene("sphere_on_plane", surfaces, (form, on_ball), (1.2 * radius, 0.0, 0.0), 5.0 * radius)
-
-
-def _floor() -> Patch:
-    return Patch((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-
-
-def _wedge(angle_deg: float) -> tuple[tuple[Patch, Patch], tuple[ClosedForm, ClosedForm]]:
-    """Half-planes from the y axis along +x and along the interior angle, with normals into the interior."""
-    sine, cosine = math.sin(math.radians(angle_deg)), math.cos(math.radians(angle_deg))
-    half = (0.0, math.inf)
-    floor = Patch((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), u_range=half)
-    face = Patch((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (cosine, 0.0, sine), v_range=half)
-    forms = [partial(_on_wedge, angle_deg=angle_deg, inward=np.array(patch.normal)) for patch in (floor, face)]
-    return (floor, face), (forms[0], forms[1])
-
-
-def _slat(name: str, gap: float, height: float) -> AnalyticScene:
-    slat = Patch((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), v_range=(gap, gap + height))
-    form = partial(_floor_under, form=_beside_slat, sizes=(gap, height))
-    top = gap + height
-    return AnalyticScene(name, (_floor(), slat), (form, _above_floor), (0.6 * top, 0.0, 0.0), 3.0 * top)
-
-
-def _always_open(points: Array, normals: Array, question: Question) -> Array:
-    return np.ones(len(points))
-
-
-def _on_wedge(points: Array, normals: Array, question: Question, *, angle_deg: float, inward: Array) -> Array:
-    angle = np.where(normals @ inward > 0, angle_deg, 360.0 - angle_deg)
-    return closed_forms.dihedral(np.hypot(points[:, 0], points[:, 2]), angle, **question)
-
-
-def _between_plates(points: Array, normals: Array, question: Question, *, height: float, up: float) -> Array:
-    return np.where(up * normals[:, 2] > 0, closed_forms.ceiling(height, **question), 1.0)
-
-
-def _above_floor(points: Array, normals: Array, question: Question) -> Array:
-    """A point of any normal that only the floor occludes."""
-    return closed_forms.half_space(np.abs(points[:, 2]), -normals[:, 2], **question)
-
-
-def _on_sphere(points: Array, normals: Array, question: Question, *, sphere_radius: float) -> Array:
-    outside = ((points - np.array([0.0, 0.0, sphere_radius])) * normals).sum(axis=1) > 0
-    return np.where(outside, _above_floor(points, normals, question), np.nan)
-
-
-def _floor_under(
-    points: Array,
-    normals: Array,
-    question: Question,
-    *,
-    form: Callable[..., Array],
-    sizes: tuple[float, ...],
-) -> Array:
-    """The floor below an occluder: open from underneath; thin and round occluders have no volumetric form."""
-    above = np.nan if question["weighting"] == "volumetric" else form(points, *sizes, **question)
-    return np.where(normals[:, 2] > 0, above, 1.0)
-
-
-def _beside_slat(points: Array, gap: float, height: float, **question: object) -> Array:
-    return closed_forms.raised_slat(np.abs(points[:, 0]), gap, height, **question)  # type: ignore[arg-type]
-
-
-def _beside_sphere(points: Array, sphere_radius: float, **question: object) -> Array:
-    lateral = np.hypot(points[:, 0], points[:, 1])
-    return closed_forms.sphere_on_plane(lateral, sphere_radius, **question)  # type: ignore[arg-type]
 
 
 def _world_rays(camera: Camera) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,1 @@
+"""Techniques that others ship, written from their published formulae, to be measured beside this library."""

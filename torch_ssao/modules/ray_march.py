@@ -1,0 +1,135 @@
+"""Ray-marched screen-space ambient occlusion as a module."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from torch import Tensor
+
+from torch_ssao import checks
+from torch_ssao.camera import Camera
+from torch_ssao.modules.base import AmbientVisibility, ParameterSpec, Positive
+from torch_ssao.ops.normals import normals_from_points
+from torch_ssao.ops.ray_march import GRADIENTS, ray_march_visibility
+from torch_ssao.ops.sampling import poisson_disk, tiled_noise
+
+
+@final
+class RayMarchedSSAO(AmbientVisibility):
+    """Ray-marched ambient occlusion: the plain ambient-occlusion integral, with rays that see the depth layers.
+
+    Normals are taken from the G-buffer, or estimated from the depth where it has none (`ops.normals`).
+
+    Args:
+        radius: length of the rays, scene units, > 0.
+        falloff: exponent p of the attenuation 1 - (distance / radius)^p, > 0; 1 is the paper's, large is binary.
+        contrast: exponent of the visibility, > 0.
+        rays: rays a pixel, >= 1.
+        steps: steps a ray, >= 1, uniform.
+        thickness: how far solids reach behind their last known surface, of the radius, > 0; None: for ever.
+        gradient: "exact", "surrogate" or "soft"; see `ops.ray_march`. With "exact" the gradient to
+            thickness is 0.
+        surrogate_width: width of the sigmoid of "surrogate" and "soft", of the radius, > 0.
+        max_radius_px: longest ray on the screen, in pixels; nearer pixels, where the radius spans more, get the radius
+            that spans as much: less far-reaching occlusion there. None: no limit.
+        denoise: passes of `ops.denoise.denoise_visibility`, before the contrast.
+        learnable: names of the parameters to register as `nn.Parameter`s, or "all"; the rest are buffers.
+    Raises:
+        RangeError, ChoiceError.
+    Gradients, Cost, Source: see `ops.ray_march.ray_march_visibility`.
+    """
+
+    PARAMETERS = {
+        "radius": ParameterSpec("scene units", 1 / 64, 64.0, "length of the rays", relative_bounds=True),
+        "falloff": ParameterSpec("1", 1e-1, 1e2, "exponent of the attenuation with distance"),
+        "thickness": ParameterSpec("of the radius", 1e-2, 1e2, "depth of solids behind their surface", optional=True),
+        "contrast": ParameterSpec("1", 1e-2, 1e2, "exponent of the visibility"),
+    }
+    CHOICES = ("rays", "steps", "gradient", "surrogate_width", "max_radius_px", "denoise")
+
+    falloff = Positive()
+    thickness = Positive()
+
+    rays: int
+    steps: int
+    gradient: str
+    surrogate_width: float
+    max_radius_px: float | None
+
+    def __init__(
+        self,
+        radius: float = 0.5,
+        *,
+        falloff: float = 1.0,
+        contrast: float = 1.0,
+        rays: int = 16,
+        steps: int = 8,
+        thickness: float | None = None,
+        gradient: str = "exact",
+        surrogate_width: float = 0.05,
+        max_radius_px: float | None = None,
+        denoise: int = 0,
+        learnable: str | tuple[str, ...] = (),
+    ) -> None:
+        for name, count, low in (("rays", rays, 1), ("steps", steps, 1), ("denoise", denoise, 0)):
+            checks.check_count(name, count, low)
+        checks.check_choice("gradient", gradient, GRADIENTS)
+        checks.check_positive("surrogate_width", surrogate_width)
+        if max_radius_px is not None:
+            checks.check_positive("max_radius_px", max_radius_px)
+        values = {"radius": radius, "falloff": falloff, "thickness": thickness, "contrast": contrast}
+        choices = {
+            "rays": rays,
+            "steps": steps,
+            "gradient": gradient,
+            "surrogate_width": surrogate_width,
+            "max_radius_px": max_radius_px,
+            "denoise": denoise,
+        }
+        super().__init__(values, choices, learnable)
+
+    def _visibility(
+        self, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera, *, frame: int, backend: str
+    ) -> Tensor:
+        batch, layers, height, width = depth.shape
+        points = camera.unproject(depth)
+        rotation, offset = tiled_noise(height, width, frame, dtype=depth.dtype, device=depth.device)
+        radius, falloff = (value.to(depth.dtype).expand(batch) for value in (self.radius, self.falloff))
+        thickness = None if self.thickness is None else self.thickness.to(depth.dtype).expand(batch)
+        intrinsics = torch.stack((camera.fx, camera.fy, camera.cx, camera.cy), 1).to(depth.dtype)
+        nearest = _repaired(normal) if normal is not None else normals_from_points(points[:, :, 0], valid[:, 0])
+        deeper = [normals_from_points(points[:, :, layer], valid[:, layer]) for layer in range(1, layers)]
+        return ray_march_visibility(
+            points,
+            valid,
+            torch.stack((nearest, *deeper), 2),
+            self._reach(radius, depth[:, 0], camera),
+            falloff,
+            thickness,
+            intrinsics,
+            poisson_disk(self.rays, dtype=depth.dtype, device=depth.device),
+            rotation,
+            offset,
+            steps=self.steps,
+            orthographic=camera.is_orthographic,
+            gradient=self.gradient,
+            surrogate_width=self.surrogate_width,
+        )
+
+    def _reach(self, radius: Tensor, depth: Tensor, camera: Camera) -> Tensor:
+        """(B, H, W) length of each pixel's rays."""
+        reach = radius[:, None, None].expand(depth.shape)
+        if self.max_radius_px is None:
+            return reach
+        focal = torch.maximum(camera.fx, camera.fy).to(depth.dtype)[:, None, None]
+        scale = 1.0 if camera.is_orthographic else depth
+        return torch.minimum(reach, self.max_radius_px * scale / focal)
+
+
+def _repaired(normal: Tensor) -> Tensor:
+    """Unit normals; where one is not finite or zero, one that faces the eye, without gradient."""
+    length = torch.linalg.vector_norm(torch.nan_to_num(normal.detach(), nan=0.0, posinf=0.0, neginf=0.0), dim=1)
+    usable = (torch.isfinite(normal).all(1) & (length > 1e-6) & torch.isfinite(length))[:, None]
+    facing = normal.new_tensor([0.0, 0.0, -1.0]).view(1, 3, 1, 1)
+    return torch.nn.functional.normalize(torch.where(usable, normal, facing), dim=1)

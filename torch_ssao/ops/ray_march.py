@@ -1,0 +1,306 @@
+"""Ray-marched screen-space ambient occlusion: Poisson-disk rays through depth layers.
+
+Rays start at the nearest layer; directions are disk points turned by `rotation` and shifted within their rings,
+lifted to the hemisphere and aligned to the normal. Step j = 1 ... `steps` at j R / steps reads the whole pixel it
+falls on; the stored sample stands for its tangent plane there, so that a plane never occludes itself at any angle
+(up to 88.9 degrees, where slopes are capped): the allowance for a pixel's footprint is its slope times the step's
+offset from the pixel's centre, and a step must lie 8 eps (|x| + R) below the plane. The first step inside a solid
+is a hit, at the distance of Eq. 1; a ray counts 1 without a hit, 1 - W_p(distance / R) with one.
+Layers 0, 1, 2, ... are entry, exit, entry, ...: inside is behind an entry and before the next valid exit, and, with
+a thickness, no deeper than that behind the entry.
+Steps off the screen or behind the eye never occlude; a ray counts by the share of its steps that fall in the image
+(whatever they meet), and pixels of which nothing was seen are open. Invalid samples are open space.
+Gradients: "exact" - almost everywhere, hits held constant: through Eq. 1 and W. "surrogate" - a hit differentiates as
+sigmoid(depth behind / width) (exits and thickness alike) around the hard value. "soft" - value and gradient of the
+sigmoid form itself, which darkens planes at grazing rays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ssao import checks
+from torch_ssao.ops import ray_march_hit as hit
+from torch_ssao.ops.ray_march_hit import MIN_FACING, Pixels, Steps
+from torch_ssao.ops.recompute import Outputs, pull_back, push_forward, recompute
+
+GRADIENTS = ("exact", "surrogate", "soft")
+_TAPS_AT_ONCE = {"cpu": 2**17, "cuda": 2**21}  # a block fits the cache of a core, or fills a GPU
+
+
+def ray_march_visibility(
+    points: Tensor,
+    valid: Tensor,
+    normal: Tensor,
+    reach: Tensor,
+    falloff: Tensor,
+    thickness: Tensor | None,
+    intrinsics: Tensor,
+    disk: Tensor,
+    rotation: Tensor,
+    offset: Tensor,
+    *,
+    steps: int,
+    orthographic: bool,
+    gradient: str = "exact",
+    surrogate_width: float = 0.05,
+) -> Tensor:
+    """Visibility of every pixel from rays marched through the depth layers.
+
+    How rays march, what a hit is and what the screen's edge does: see the module.
+
+    Args:
+        points: (B, 3, L, H, W) view-space positions, scene units, finite everywhere.
+        valid: (B, L, H, W) bool.
+        normal: (B, 3, L, H, W) unit normals of each layer; layer 0's orient the hemisphere.
+        reach: (B, H, W) length R of the rays, scene units, > 0.
+        falloff: (B,) exponent p of the attenuation, > 0.
+        thickness: (B,) of the reach, > 0; None for solids without end.
+        intrinsics: (B, 4) fx, fy, cx, cy in pixels.
+        disk: (K, 2) points inside the unit disk, one a ray, one a ring of equal area.
+        rotation, offset: (H, W) turns of the disk, and places of the points within their rings, in [0, 1): noise over
+            which the mean does not depend on the number of rays.
+        steps: steps a ray, >= 1.
+        orthographic: parallel projection along +z.
+        gradient: "exact", "surrogate" or "soft", see the module.
+        surrogate_width: width of the sigmoid, of the reach, > 0.
+    Returns: (B, H, W) in [0, 1]; 1 at invalid pixels.
+    Gradients: to points, normal, reach, falloff and (not "exact") thickness; to the camera through points. Forward
+        mode alike. Second derivatives raise a RuntimeError.
+    Cost: K steps reads of L samples; saved: the inputs and two floats a pixel, whatever the rays and steps.
+    Raises: RangeError, ChoiceError.
+    Source: Poisson-based ray-marched SSAO, Algorithm 1, Eqs. 1 and 2.
+    """
+    checks.check_count("steps", steps, 1)
+    checks.check_choice("gradient", gradient, GRADIENTS)
+    checks.check_positive("surrogate_width", surrogate_width)
+    height, width = valid.shape[2:]
+    spec = _Spec(steps, height, width, orthographic, gradient, surrogate_width)
+    visibility = recompute(
+        _March(spec, disk, rotation.reshape(-1), offset.reshape(-1)),
+        points[:, :, 0].flatten(2),
+        normal[:, :, 0].flatten(2),
+        reach.flatten(1),
+        falloff,
+        thickness,
+        tangent_planes(points, normal, orthographic=orthographic).flatten(2, 3).transpose(1, 2).contiguous(),
+        valid.flatten(2).transpose(1, 2),
+        intrinsics.detach(),
+    )
+    return visibility.unflatten(1, (height, width))
+
+
+def tangent_planes(points: Tensor, normal: Tensor, *, orthographic: bool) -> Tensor:
+    """Planes through samples: unit normal n and n . point, tilted towards the eye where they face it too little.
+
+    Args:
+        points, normal: (B, 3, L, H, W).
+        orthographic: parallel projection.
+    Returns: (B, L, H, W, 4); the cosine between n and the ray to the eye is at least `MIN_FACING`.
+    Gradients: to both.
+    """
+    if orthographic:
+        ray = points.new_tensor([0.0, 0.0, 1.0]).view(1, 3, 1, 1, 1)
+    else:
+        length = points.square().sum(1, keepdim=True).clamp(min=torch.finfo(points.dtype).tiny).sqrt()
+        ray = points / length
+    lacking = ((normal * ray).sum(1, keepdim=True) + MIN_FACING).clamp(min=0)
+    facing = normal - lacking * ray
+    return torch.cat((facing, (facing * points).sum(1, keepdim=True)), 1).movedim(1, -1)
+
+
+class _Spec(NamedTuple):
+    steps: int
+    height: int
+    width: int
+    orthographic: bool
+    gradient: str
+    surrogate_width: float
+
+
+class _Inputs(NamedTuple):
+    """N pixels a batch, L layers."""
+
+    position: Tensor  # (B, 3, N)
+    normal: Tensor  # (B, 3, N)
+    reach: Tensor  # (B, N)
+    falloff: Tensor  # (B,)
+    thickness: Tensor | None  # (B,)
+    planes: Tensor  # (B, N, L, 4)
+    valid: Tensor  # (B, N, L)
+    intrinsics: Tensor  # (B, 4)
+
+
+def _inputs(tensors: Sequence[Tensor | None]) -> _Inputs:
+    inputs = _Inputs(*tensors)  # type: ignore[arg-type]
+    return inputs._replace(planes=inputs.planes.contiguous())  # what is read at random lies together
+
+
+class _Block(NamedTuple):
+    """Some rays of some pixels of some images."""
+
+    rays: slice
+    images: slice
+    pixels: slice
+
+    def cut(self, tensors: Sequence[Tensor | None]) -> list[Tensor | None]:
+        """Position, normal, reach, falloff, thickness of this block; views, vectors with their axis first."""
+        position, normal, reach, falloff, thickness = tensors
+        vectors = [None if t is None else t[self.images, :, self.pixels].movedim(1, 0) for t in (position, normal)]
+        images = None if reach is None else reach[self.images, self.pixels]
+        return [*vectors, images, *(None if t is None else t[self.images, None] for t in (falloff, thickness))]
+
+
+class _March(NamedTuple):
+    """The kernel: see `recompute.Kernel`."""
+
+    spec: _Spec
+    disk: Tensor
+    rotation: Tensor
+    offset: Tensor
+    name: str = "ray_march_visibility"
+
+    def value(self, *tensors: Tensor | None) -> Outputs:
+        inputs = _inputs(tensors)
+        total, weight = torch.zeros_like(inputs.reach), torch.zeros_like(inputs.reach)
+        for block in self.blocks(inputs):
+            piece = _Piece(self, block, inputs)
+            total[block.images, block.pixels] += piece.visibility(*piece.leaves)[0]
+            weight[block.images, block.pixels] += piece.weight.sum(0)
+        seen = inputs.valid[:, :, 0] & (weight > 0)
+        return torch.where(seen, total / weight.clamp(min=1e-6), 1.0), torch.where(seen, weight, torch.inf)
+
+    def pull_back(
+        self, grad: Tensor, needed: Sequence[bool], outputs: Outputs, *tensors: Tensor | None
+    ) -> list[Tensor]:
+        inputs = _inputs(tensors)
+        per_ray = grad / outputs[1]
+        totals = [None if t is None else torch.zeros_like(t) for t in inputs[:5]]
+        planes = torch.zeros_like(inputs.planes)
+        flat = planes.view(-1, planes.shape[2] * 4)
+        for block in self.blocks(inputs):
+            piece = _Piece(self, block, inputs)
+            *parts, rows = pull_back(piece.visibility, piece.leaves, [per_ray[block.images, block.pixels]])
+            targets = [target for target in block.cut(totals) if target is not None]
+            for target, part in zip(targets, parts, strict=True):
+                target += part
+            if needed[5]:
+                flat.index_add_(0, piece.rows_at.flatten(), rows.flatten(0, -3).flatten(1))
+        return [total for total, want in zip([*totals, planes], needed, strict=False) if want and total is not None]
+
+    def push_forward(self, tangents: Sequence[Tensor | None], outputs: Outputs, *tensors: Tensor | None) -> Tensor:
+        inputs = _inputs(tensors)
+        moves = [
+            None if t is None else (torch.zeros_like(t) if move is None else move)
+            for t, move in zip(inputs[:6], tangents[:6], strict=True)
+        ]
+        total = torch.zeros_like(inputs.reach)
+        for block in self.blocks(inputs):
+            piece = _Piece(self, block, inputs)
+            leaves = [move for move in block.cut(moves[:5]) if move is not None]
+            leaves.append(_rows(moves[5], piece.rows_at))  # type: ignore[arg-type]
+            (pushed,) = push_forward(piece.visibility, piece.leaves, leaves)
+            total[block.images, block.pixels] += pushed
+        return total / outputs[1]
+
+    def blocks(self, inputs: _Inputs) -> Iterator[_Block]:
+        batch, count = inputs.reach.shape
+        budget = max(1, _TAPS_AT_ONCE.get(inputs.reach.device.type, 2**17) // self.spec.steps)
+        pixels = min(count, budget)
+        images = min(batch, max(1, budget // count))
+        rays = min(len(self.disk), max(1, budget // (pixels * images)))
+        for image in range(0, batch, images):
+            for pixel in range(0, count, pixels):
+                for ray in range(0, len(self.disk), rays):
+                    yield _Block(slice(ray, ray + rays), slice(image, image + images), slice(pixel, pixel + pixels))
+
+
+class _Piece:
+    """The rays of a block: where their steps fall, and their visibility as a function of the differentiable inputs."""
+
+    def __init__(self, kernel: _March, block: _Block, inputs: _Inputs) -> None:
+        self.spec = spec = kernel.spec
+        noise = kernel.rotation[block.pixels], kernel.offset[block.pixels]
+        self.sampling = kernel.disk[block.rays], len(kernel.disk), *noise
+        cut = block.cut(inputs[:5])
+        self.given = [part is not None for part in cut]
+        pixels = Pixels(*cut)  # type: ignore[arg-type]
+        place = hit.march(pixels, hit.directions(pixels.normal, *self.sampling), spec.steps)
+        self.steps = _read(place, inputs, block, spec)
+        self.weight = self.steps.seen.to(pixels.reach.dtype).mean(0)
+        rows = _rows(inputs.planes, self.steps.sample)
+        behind, height = hit.depth_behind(place, rows, spec.orthographic)
+        thickness = None if pixels.thickness is None else pixels.thickness * pixels.reach
+        known = self.steps.known
+        self.inside = self.steps.seen & hit.is_inside(behind, height, known, hit.tolerance(pixels), thickness)
+        self.rows_at = self.steps.sample
+        if spec.gradient == "exact":
+            self.found = self.inside.any(0)
+            self.first = hit.first_inside(self.inside)
+            pair = torch.cat(((self.first - 1).clamp(min=0), self.first))
+            self.rows_at = self.steps.sample.gather(0, pair)
+            self.pair_known = torch.stack([known[..., layer].gather(0, pair) for layer in range(known.shape[-1])], -1)
+            rows = _rows(inputs.planes, self.rows_at)
+        self.leaves = [*(part for part in cut if part is not None), rows]
+
+    def visibility(self, *leaves: Tensor) -> tuple[Tensor]:
+        """Weighted visibility (b, P), summed over the rays of the block; `leaves` as `self.leaves`."""
+        parts = iter(leaves[:-1])
+        pixels = Pixels(*(next(parts) if given else None for given in self.given))  # type: ignore[arg-type]
+        direction = hit.directions(pixels.normal, *self.sampling)
+        open_share = self._at_hit if self.spec.gradient == "exact" else self._along
+        return ((self.weight * open_share(pixels, direction, leaves[-1])).sum(0),)
+
+    def _at_hit(self, pixels: Pixels, direction: Tensor, rows: Tensor) -> Tensor:
+        """Hits held constant: only the steps before and behind the surface matter."""
+        steps = self.spec.steps
+        first = self.first[0] + 1
+        along = torch.stack((first - 1, first)).to(rows.dtype) / steps
+        place = pixels.position[:, None, None] + (along * pixels.reach) * direction[:, None]
+        behind, _ = hit.depth_behind(place, rows, self.spec.orthographic)
+        distance, bounded = hit.nearest_surface(behind, self.pair_known)
+        at_pixel = first == 1
+        before = torch.where(at_pixel, 0.0, distance[0])
+        value = hit.openness(before, bounded[0] | at_pixel, distance[1], first, pixels, steps)
+        return torch.where(self.found, value, 1.0)
+
+    def _along(self, pixels: Pixels, direction: Tensor, rows: Tensor) -> Tensor:
+        """Every step may become a hit, or cease to be one."""
+        spec, known = self.spec, self.steps.known
+        place = hit.march(pixels, direction, spec.steps)
+        behind, _ = hit.depth_behind(place, rows, spec.orthographic)
+        thickness = None if pixels.thickness is None else pixels.thickness * pixels.reach
+        soft = hit.soft_inside(behind, known, spec.surrogate_width * pixels.reach, thickness) * self.steps.seen
+        after, bounded = hit.nearest_surface(behind, known)
+        before = torch.cat((torch.zeros_like(after[:1]), after[:-1]))
+        bounded = torch.cat((torch.ones_like(bounded[:1]), bounded[:-1]))
+        number = torch.arange(1, spec.steps + 1, device=rows.device).view(-1, 1, 1, 1)
+        open_at = hit.openness(before, bounded, after, number, pixels, spec.steps)
+        if spec.gradient == "surrogate":
+            soft = self.inside + (soft - soft.detach())
+        return hit.last_to_first(soft, open_at)[0]
+
+
+def _read(place: Tensor, inputs: _Inputs, block: _Block, spec: _Spec) -> Steps:
+    """Whole-pixel positions of steps."""
+    x, y, z = place
+    fx, fy, cx, cy = inputs.intrinsics[block.images].T[:, :, None]
+    ahead = z > 0
+    scale = 1.0 if spec.orthographic else 1 / torch.where(ahead, z, 1.0)
+    column, row = fx * x * scale + cx, fy * y * scale + cy
+    seen = ahead & (column >= 0) & (column < spec.width) & (row >= 0) & (row < spec.height)
+    first = torch.arange(len(inputs.reach), device=x.device)[block.images, None] * inputs.reach.shape[1]
+    index = torch.where(seen, row, 0.0).long() * spec.width + torch.where(seen, column, 0.0).long() + first
+    known = inputs.valid.reshape(-1, inputs.valid.shape[2])[index]
+    return Steps(seen, index, known)
+
+
+def _rows(planes: Tensor, index: Tensor) -> Tensor:
+    """(*index, L, 4) planes at flat indices."""
+    layers = planes.shape[2]
+    rows = planes.reshape(-1, 4 * layers).index_select(0, index.flatten())
+    return rows.view(*index.shape, layers, 4)
