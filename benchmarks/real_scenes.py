@@ -4,7 +4,7 @@
 
 FOLDER holds meshes and a scenes.json with cameras and radii (see `ts.scenes.load`). References are binary, traced once and kept in
 out/real_scenes. Every model is fitted at the fit size and judged at the full size: a radius in scene units depends on neither. PSNR
-is that of the mean squared error over all judged views. Rows go to benchmarks/results/real_scenes.json; those of other runs are kept.
+is that of the mean squared error over all judged views. Rows go to benchmarks/results/real_scenes.json, beside earlier ones.
 """
 
 from __future__ import annotations
