@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 import torch
 
+import torch_ssao as ts
 from support.hard_case_list import CASES, SCENES, HardCase
-from support.hard_case_scenes import halved, horizon, pillar
+from support.hard_case_scenes import facets, halved, horizon, pillar
 from support.hard_cases import TECHNIQUES, derivatives, make
 
 PINNED = 0.25  # a known failure may move by this before the record has to be brought up to date
@@ -81,6 +82,15 @@ def test_halo_just_beyond_the_radius_has_a_remedy(name: str, remedy: dict[str, A
     gb = pillar(1.2)
     assert bool((make(name, 1.0, **remedy)(gb)[gb.depth == 6.0] > 0.999).all())
     assert bool((make(name, 1.0, **remedy)(pillar(0.5))[gb.depth == 6.0] < 0.99).any())  # not by seeing nothing
+
+
+@pytest.mark.parametrize("name", ["march", "march-thick"])
+def test_rays_see_no_facets_with_normals_estimated_from_the_depth(name: str) -> None:
+    gb = facets()
+    assert gb.normal is not None
+    front = (gb.normal[:, 2:] < -0.5) & gb.valid_mask
+    bare = ts.GBuffer(gb.depth, gb.camera, valid=gb.valid)
+    assert (1 - make(name, 0.5)(bare))[front].mean() < 2e-3
 
 
 def test_unconnected_taps_leave_the_horizon_open() -> None:

@@ -67,6 +67,20 @@ CASES = (
         known={"statvo": 0.377, "bitmask": 0.148, "increments": 0.0173, "march": 0.396, "march-thick": 0.0179},
     ),
     HardCase(
+        *(1, "Thin occluders: a slat 0.3 R over a floor, defaults", _HALO, figures.under_slat),
+        meaning="mean error on the floor beside it",
+        most=0.05,
+        known={"bitmask": -0.106, "increments": -0.0548, "march": -0.147, "march-thick": -0.0957},
+        techniques=CAPPED,
+    ),
+    HardCase(
+        *(1, "The same with a thickness of 0.05 R and many taps", _HALO, figures.thin_occluder),
+        meaning="mean error on the floor beside it",
+        most=0.02,
+        known={"increments": 0.0463},
+        techniques=("bitmask", "increments", "march-thick"),
+    ),
+    HardCase(
         *(2, "Dark rims: a sphere before a far plane", "three.js#33663, godot#107011", figures.rims),
         meaning="largest change that the plane makes within 3 px of the outline",
         most=1e-3,
@@ -137,6 +151,12 @@ CASES = (
         meaning="values outside [0, 1] and derivatives that are not finite",
         most=0,
         known={"statvo": 2779},
+    ),
+    HardCase(
+        *(10, "Normals of length 0.8 and 1.25", _NAN, figures.normal_length),
+        meaning="largest change",
+        most=1e-3,
+        known={"statvo": 0.0714, "bitmask": 0.0163, "increments": 0.0146},
     ),
     HardCase(
         *(10, "Valid depths of 3e38 and 1e-20 in float32", _NAN, figures.absurd_depths),

@@ -72,6 +72,19 @@ def near_halo(name: str) -> float:
     return worst(1 - make(name, 1.0)(gb), gb.depth == 6.0)
 
 
+def under_slat(name: str, **changes: Any) -> float:
+    """Mean error on the floor beside and under a thin slat 0.3 above it, R = 1."""
+    scene = analytic.raised_slat(0.3, 0.4)
+    gb = scene.render(scene.camera(*scenes.SIZE, view_angle_deg=50.0, span=3.0))
+    exact, known = scene.exact(gb, radius=1.0, falloff="linear" if name in MARCH else "binary")
+    middle = (..., slice(12, 36), slice(16, 48))
+    return float((make(name, 1.0, **changes)(gb) - exact)[middle][(known & (exact < 0.999))[middle]].mean())
+
+
+def thin_occluder(name: str) -> float:
+    return under_slat(name, thickness=0.05, **TAPS[name][1])
+
+
 def rims(name: str) -> float:
     before, alone = (make(name, 0.5)(scenes.ball(plane=plane)) for plane in (True, False))
     return worst(before - alone, scenes.rim())
@@ -168,6 +181,13 @@ def damage(name: str) -> float:
     """Values that are not in [0, 1], and gradients that are not finite."""
     image, grads = derivatives(name, scenes.damaged(), torch.float32)
     return float((~((image >= 0) & (image <= 1))).sum()) + sum(float((~torch.isfinite(g)).sum()) for g in grads)
+
+
+def normal_length(name: str) -> float:
+    """Normals as interpolation shortens them, and as scaling lengthens them."""
+    gb, net = scenes.steps(), make(name, 0.4)
+    assert gb.normal is not None
+    return max(worst(net(replace(gb, normal=gb.normal * length)) - net(gb)) for length in (0.8, 1.25))
 
 
 def absurd_depths(name: str) -> float:
