@@ -7,8 +7,12 @@ STAMP := $(VENV)/.installed
 .PHONY: demo test test-slow lint bench clean
 
 demo: $(STAMP)
-	$(BIN)/torch-ssao report heap --size 240x180 --samples 256 --fit-views 0,1 --max-evaluations 90 --out out/demo
+	$(BIN)/torch-ssao report heap --technique all --layers 1,4 --size 240x180 --samples 256 --fit-views 0,1 \
+		--max-evaluations 60 --out out/demo
 	@echo "open out/demo/report.html"
+
+docs/demo.png: demo
+	cp out/demo/techniques.png $@
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -q

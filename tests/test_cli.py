@@ -16,6 +16,7 @@ from PIL import Image
 import torch_ssao as ts
 from support.reports import corner, fake_fit
 from torch_ssao import cli, fitting, reference, scenes
+from torch_ssao.cli import commands, parser
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(ts.__file__).parents[1])}  # found from any folder, installed or not
 TINY = ["--size", "48x36", "--samples", "16"]
@@ -142,6 +143,36 @@ def test_fitting_every_view_says_that_errors_flatter(mesh: tuple[str, str], caps
     assert "flatter" in text
 
 
+def test_render_a_chosen_technique_with_its_options() -> None:
+    gbuffer = scenes.render(scenes.builtin("temple"), views=3, height=36, width=48)
+    asked = {
+        ts.HBAO(
+            0.6, slices=2, steps=3, thickness=None, denoise=1
+        ): "hbao --slices 2 --steps 3 --thickness none --denoise 1",
+        ts.RayMarchedSSAO(0.6, rays=3, steps=4, thickness=0.5): "raymarch --rays 3 --steps 4 --thickness 0.5",
+        ts.StatVO(0.6, layers=3, layering="uniform", quadrants=False, sat_scale=2): (
+            "statvo --layers 3 --layering uniform --no-quadrants --sat-scale 2"
+        ),
+    }
+    for module, options in asked.items():
+        argv = ["render", "temple", "--views", "3", *TINY, "--radius", "0.6", "--out", "o", "--technique"]
+        assert cli.main([*argv, *options.split()]) == 0
+        expected = np.rint(255 * module(gbuffer)[0, 0].numpy())
+        assert np.array_equal(np.asarray(Image.open("o/visibility_3.png")), expected), options
+
+
+@pytest.mark.usefixtures("quick_fit")
+def test_report_compares_all_techniques(mesh: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ["report", mesh[0], "--cameras", mesh[1], "--radius", "0.5", *TINY, "--out", "o", "--technique", "all"]
+    assert cli.main([*argv, "--layers", "1", "--slices", "2", "--steps", "2,3", "--rays", "2"]) == 0
+    names = ["statvo_1", "hbao_2x2", "hbao_2x3", "ray_march_2x2", "ray_march_2x3"]
+    assert [row["name"] for row in json.loads(Path("o/report.json").read_text())["rows"]] == 2 * names
+    text = capsys.readouterr().out
+    for start in ("StatVO 1 layer, untuned", "HBAO 2x3, fitted", "ray march 2x2, fitted"):
+        assert any(line.startswith(start) for line in text.splitlines()), start
+    assert Path("o/techniques.png").is_file()
+
+
 @pytest.mark.slow
 def test_fit_for_real(mesh: tuple[str, str]) -> None:
     argv = ["fit", mesh[0], "--cameras", mesh[1], "--radius", "0.5", "--layers", "1", *TINY, "--out", "o", "--quiet"]
@@ -187,7 +218,40 @@ def test_bad_arguments(capsys: pytest.CaptureFixture[str], command: str, options
 
 def test_an_unknown_technique_names_the_choices(capsys: pytest.CaptureFixture[str]) -> None:
     told = error_of(capsys, "fit", "temple", "--technique", "magic")
-    assert "technique must be one of 'statvo', got 'magic'" in told
+    assert "technique must be one of 'statvo', 'hbao', 'ray_march', got 'magic'" in told
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ("--technique hbao --layers 2", "--layers must be left out with --technique hbao, which has --slices, --steps"),
+        ("--technique hbao --rays 2", "or choose --technique ray_march"),
+        ("--technique raymarch --no-quadrants", "--quadrants must be left out with --technique ray_march"),
+        ("--slices 2", "--slices must be left out with --technique statvo, which has --layers, --quadrants"),
+        ("--technique hbao --estimator magic", "estimator must be one of"),
+        ("--technique hbao --slices 0", "slices must be a whole number at least 1"),
+        ("--technique hbao --thickness thick", "--thickness: must be a positive number or none, got 'thick'"),
+        ("--technique hbao --thickness -1", "thickness must be finite and greater than 0"),
+    ],
+)
+@pytest.mark.parametrize("command", ["render", "fit", "report"])
+def test_options_of_another_technique(
+    capsys: pytest.CaptureFixture[str], command: str, options: str, expected: str
+) -> None:
+    assert expected in error_of(capsys, command, "temple", *options.split())
+    assert not list(Path().iterdir())
+
+
+def test_an_option_that_one_of_several_techniques_has_is_allowed(capsys: pytest.CaptureFixture[str]) -> None:
+    told = error_of(capsys, "fit", "temple", "--technique", "statvo,hbao", "--slices", "2,3", "--steps", "1,2,3")
+    assert "slices and steps must be as many" in told  # past the check of the options
+    assert "--rays must be left out" in error_of(capsys, "fit", "temple", "--technique", "statvo,hbao", "--rays", "2")
+
+
+def test_render_takes_one_technique(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--technique must be one technique, got statvo,hbao" in error_of(
+        capsys, "render", "temple", "--technique", "statvo,hbao"
+    )
 
 
 def test_a_camera_that_sees_nothing(capsys: pytest.CaptureFixture[str], mesh: tuple[str, str]) -> None:
@@ -206,7 +270,9 @@ def test_a_broken_camera_file(capsys: pytest.CaptureFixture[str], mesh: tuple[st
 
 def test_a_module_file_that_is_none(capsys: pytest.CaptureFixture[str]) -> None:
     assert "path 'none.json' does not exist" in error_of(capsys, "render", "temple", "--module", "none.json")
-    assert "--layers must be left out" in error_of(capsys, "render", "temple", "--module", "a.json", "--layers", "2")
+    for option in (("--layers", "2"), ("--technique", "hbao"), ("--denoise", "1")):
+        told = error_of(capsys, "render", "temple", "--module", "a.json", *option)
+        assert f"{option[0]} must be left out with --module" in told
 
 
 def test_no_command_and_an_unknown_one(capsys: pytest.CaptureFixture[str]) -> None:
@@ -218,7 +284,7 @@ def test_a_missing_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest
     def missing(arguments: Any) -> None:
         raise ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib.figure")
 
-    monkeypatch.setattr(cli, "scenes_command", missing)
+    monkeypatch.setattr(commands, "scenes_command", missing)
     assert "run pip install 'torch_ssao[report]'" in error_of(capsys, "scenes")
 
 
@@ -228,7 +294,7 @@ def test_an_error_of_the_system_is_one_line(
     def full(arguments: Any) -> None:
         raise OSError(28, "No space left\non device", "a.png")
 
-    monkeypatch.setattr(cli, "scenes_command", full)
+    monkeypatch.setattr(commands, "scenes_command", full)
     assert "No space left" in error_of(capsys, "scenes")
 
 
@@ -239,7 +305,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch, error: Excep
     def broken(arguments: Any) -> None:
         raise error
 
-    monkeypatch.setattr(cli, "scenes_command", broken)
+    monkeypatch.setattr(commands, "scenes_command", broken)
     with pytest.raises(type(error)):
         cli.main(["scenes"])
 
@@ -270,7 +336,7 @@ def test_help_has_an_example_that_parses(capsys: pytest.CaptureFixture[str], com
     assert ended.value.code == 0
     example = capsys.readouterr().out.rpartition("example:\n")[2].split()
     assert example[:2] == ["torch-ssao", command]
-    cli._parser().parse_args(example[1:])
+    parser.build().parse_args(example[1:])
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,9 +16,12 @@ from PIL import Image
 
 from support.reports import TINY, corner, fake_fit
 from torch_ssao import checks, fitting
-from torch_ssao.report import Measurement, html, make_report, plots, tables
+from torch_ssao.modules import TECHNIQUES
+from torch_ssao.report import Measurement, html, make_report, overview, plots, tables
 from torch_ssao.report import make as make_module
+from torch_ssao.report.rows import predict
 
+MODELS = ("StatVO 1 layer", "StatVO 2 layers", "HBAO 2x2", "ray march 2x2")
 NASTY = 'corner <b>&"'
 
 
@@ -27,6 +30,15 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Measurement:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fitting, "fit", fake_fit, raising=False)
         return make_report(corner(NASTY), tmp_path_factory.mktemp("out"), **TINY)
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Measurement:
+    """Three techniques in one report."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fitting, "fit", fake_fit, raising=False)
+        options = {"technique": tuple(TECHNIQUES), "options": {"layers": (1, 2), "rays": 2, "slices": 2, "steps": 2}}
+        return make_report(corner(), tmp_path_factory.mktemp("compared"), **TINY, **options)
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +123,61 @@ def test_table_cells(made: Measurement) -> None:
     head, matrix = tables.value_matrix(made)
     assert head == ["fitted values", "radius", "height", "falloff", "contrast"]
     assert matrix[0][3] == "1 (undetermined)"
+
+
+def test_several_techniques_share_one_page(compared: Measurement) -> None:
+    page = (compared.out / "report.html").read_text(encoding="utf-8")
+    assert len(re.findall("<img", page)) == sum(name.endswith(".png") for name in compared.files)
+    assert "techniques.png" in compared.files
+    for text in ("StatVO 2 layers", "HBAO 2x2", "ray march 2x2", "slices 2", "rays 2"):
+        assert text in page, text
+    titles = [line[0] for line in tables.score_cells(compared)]
+    assert titles[:4] == [f"{model}, untuned" for model in MODELS]
+    assert titles[4:8] == [f"{model}, fitted" for model in MODELS]
+
+
+def test_each_technique_shows_the_parameters_it_uses(compared: Measurement) -> None:
+    head, matrix = tables.value_matrix(compared)
+    assert head == ["fitted values", "radius", "height", "falloff", "contrast", "thickness"]
+    dashes = {line[0]: [name for name, cell in zip(head, line, strict=True) if cell == "-"] for line in matrix}
+    assert dashes == {
+        "StatVO 1 layer": ["thickness"],
+        "StatVO 2 layers": ["thickness"],
+        "HBAO 2x2": ["height", "falloff"],
+        "ray march 2x2": ["height", "thickness"],
+    }
+    listed = {(line[0], line[1]) for line in tables.value_cells(compared)}
+    assert ("HBAO 2x2", "thickness") in listed
+    assert not {("HBAO 2x2", "bias_deg"), ("HBAO 2x2", "falloff"), ("ray march 2x2", "thickness")} & listed
+
+
+def test_the_overview_holds_reference_and_best_fits_pixel_by_pixel(compared: Measurement) -> None:
+    best = overview.best_of_each(compared)
+    assert [row.technique for row in best] == list(TECHNIQUES)
+    statvo = [row.validation.rmse for row in compared.rows if row.technique == "statvo" and row.is_fitted]
+    assert best[0].validation.rmse == min(statvo)
+    assert all(row.is_fitted for row in best)
+    picture = np.asarray(Image.open(compared.out / "techniques.png").convert("L")).astype(int)
+    shown = [compared.truth.visibility[0, 0], *(predict(row.module, compared.gbuffer[0])[0, 0] for row in best)]
+    zoom = -(-overview.LEAST // 48)
+    for column, image in enumerate(shown):
+        left = overview.GAP + column * (48 * zoom + overview.GAP)
+        there = picture[overview.HEAD :, left:][: 36 * zoom, : 48 * zoom][zoom // 2 :: zoom, zoom // 2 :: zoom]
+        assert np.abs(there - 255 * image.numpy()).max() <= 1.5
+
+
+def test_every_technique_has_its_marker_in_the_plot(compared: Measurement, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+    real = plots._draw_rows
+    monkeypatch.setattr(
+        plots, "_draw_rows", lambda axes, rows, style: (drawn.append((rows, style)), real(axes, rows, style))
+    )
+    plots.speed_error_png(compared)
+    markers = {(rows[0].technique, style["marker"]) for rows, style in drawn}
+    assert len(markers) == len({marker for _, marker in markers}) == 3
+    assert sorted(style["label"] for _, style in drawn) == sorted(
+        f"{title}, {state}" for title in ("StatVO", "HBAO", "ray march") for state in ("untuned", "fitted")
+    )
 
 
 def test_text_table_lines_up() -> None:

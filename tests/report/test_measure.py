@@ -95,13 +95,47 @@ def test_chosen_views_radius_and_parameters(tmp_path: Path) -> None:
     assert set(measured.as_dict()["rows"][1]["fit"]["standard_errors"]) == {"radius"}
 
 
+def test_several_techniques_are_measured_on_the_same_views(tmp_path: Path) -> None:
+    options = TINY | {
+        "layers": (1,),
+        "technique": ("ray_march", "statvo", "hbao"),
+        "parameters": ("thickness", "radius"),
+    }
+    counts = {"rays": 2, "slices": (1, 2), "steps": 2, "denoise": 1}
+    measured = measure(corner(), tmp_path, **options, options=counts)
+    assert measured.techniques == ("ray_march", "statvo", "hbao")
+    names = ["ray_march_2x2", "statvo_1", "hbao_1x2", "hbao_2x2"]
+    assert [row.name for row in measured.rows] == 2 * names
+    assert [row.label for row in measured.rows[:3]] == ["ray march 2x2", "StatVO 1 layer", "HBAO 1x2"]
+    record = json.loads((tmp_path / "report.json").read_text())
+    assert record["techniques"] == ["ray_march", "statvo", "hbao"]
+    by_name = {row["name"]: row for row in record["rows"] if row["fitted"]}
+    fitted = {name: set(row["fit"]["standard_errors"]) for name, row in by_name.items()}
+    assert fitted["hbao_1x2"] == {"radius", "thickness"}
+    assert fitted["ray_march_2x2"] == fitted["statvo_1"] == {"radius"}
+    assert by_name["ray_march_2x2"]["values"]["thickness"] is None
+    assert [row["technique"] for row in record["rows"][:3]] == ["ray_march", "statvo", "hbao"]
+    assert by_name["hbao_2x2"]["choices"]["denoise"] == by_name["ray_march_2x2"]["choices"]["denoise"] == 1
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"technique": "magic"}, checks.ChoiceError, "technique must be one of 'statvo'"),
+        ({"technique": "magic"}, checks.ChoiceError, "technique must be one of 'statvo', 'hbao', 'ray_march'"),
         ({"views": [7]}, checks.RangeError, "views must be indices below 2"),
         ({"fit_views": (9,)}, checks.RangeError, "views must be indices below 2"),
         ({"parameters": ("size",)}, checks.ChoiceError, "parameters must be one of 'radius'"),
+        (
+            {"technique": ("statvo", "hbao"), "parameters": ("height",)},
+            checks.ChoiceError,
+            "parameters must name at least one of each technique, .* one of HBAO's radius, contrast, thickness",
+        ),
+        (
+            {"technique": ("hbao", "statvo"), "max_evaluations": 8},  # enough for three parameters, not for four
+            checks.RangeError,
+            "max_evaluations must be a whole number at least 10",
+        ),
+        ({"options": {"rays": 2}}, checks.ChoiceError, "options must be of statvo .* got 'rays'"),
         ({"max_evaluations": 3}, checks.RangeError, "max_evaluations must be a whole number at least 10"),
         ({"height": 10}, checks.RangeError, "height must be a whole number at least 11"),
         ({"radius": 0.0}, checks.RangeError, "radius must be finite and greater than 0"),

@@ -22,28 +22,6 @@ def image() -> torch.Tensor:
     return torch.rand(2, 1, 16, 20, generator=torch.Generator().manual_seed(3))
 
 
-def test_candidates_differ_in_layers_alone() -> None:
-    made = rows.candidates("statvo", 0.7, (1, 4))
-    assert [(name, label, module.layers) for name, label, module in made] == [
-        ("statvo_1", "1 layer", 1),
-        ("statvo_4", "4 layers", 4),
-    ]
-    for _, _, module in made:
-        assert module.values() == pytest.approx(StatVO(0.7).values())
-
-
-def test_candidates_refuse_what_cannot_be() -> None:
-    with pytest.raises(checks.ChoiceError, match="technique must be one of 'statvo', got 'magic'"):
-        rows.candidates("magic", 0.5, (1,))
-    for layers in ((), (2, 2)):
-        with pytest.raises(checks.RangeError, match="layers must name layer counts, each once"):
-            rows.candidates("statvo", 0.5, layers)
-    with pytest.raises(checks.RangeError, match="power of two"):
-        rows.candidates("statvo", 0.5, (3,))
-    with pytest.raises(checks.RangeError, match="radius"):
-        rows.candidates("statvo", -1.0, (1,))
-
-
 def test_scores_are_the_metrics_of_all_views_together(image: torch.Tensor) -> None:
     truth, guess = truth_of(image), image.flip(-1)
     found = rows.score(guess, truth)

@@ -8,6 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from torch_ssao.report import tables
+from torch_ssao.report.candidates import MEANINGS
 from torch_ssao.report.rows import Row
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ def page(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
         _scores(measurement),
         _score_notes(measurement),
         f"<h2>Pictures, view {measurement.judged_views[0]}</h2>",
+        _picture(pictures, "techniques.png", "The best fitted model of each technique beside the reference."),
         _gallery(measurement, pictures),
         "<h2>Fitted values</h2>",
         _values(measurement, pictures),
@@ -109,6 +111,7 @@ def _score_notes(measurement: Measurement) -> str:
         f"Time: median (quartiles) of {measurement.rows[0].timing.repeats} forward passes over view "
         f"{measurement.judged_views[0]}, models taking turns, no gradients."
     )
+    counts = " ".join(MEANINGS[name] for name in measurement.techniques if name in MEANINGS)
     noise = (
         "Noise ceiling: what a perfect model would score against this reference. With s the reference's standard error "
         f"at {settings.samples} rays a pixel, RMSE = sqrt(mean s²) and PSNR = -20 log10 RMSE. Two references with "
@@ -117,7 +120,7 @@ def _score_notes(measurement: Measurement) -> str:
         f"RMSE of these two references divided by sqrt(2) is {ceiling.rmse_pair:.4f}, a check of the stated "
         f"{ceiling.rmse:.4f}."
     )
-    return f'<p class="soft">{judged} {timed} {noise}</p>'
+    return f'<p class="soft">{judged} {timed} {counts} {noise}</p>'
 
 
 def _gallery(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
@@ -164,6 +167,10 @@ def _conditions(measurement: Measurement) -> str:
         "commit": where["commit"] or "not in a git checkout",
         "platform": where["platform"],
     }
+    for row in measurement.rows:
+        if not row.is_fitted:
+            choices = row.module.config().items()
+            facts[row.label] = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in choices)
     rows = "".join(
         f'<tr><td>{escape(key)}</td><td class="text">{escape(str(text))}</td></tr>' for key, text in facts.items()
     )

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 ERROR_SPAN = 0.5
 """Errors are coloured from -0.5 to 0.5, the same in all pictures, so that they can be compared."""
+ERROR_COLOURS = "RdBu_r"
 
 
 def grey_png(visibility: Tensor) -> bytes:
@@ -44,7 +45,7 @@ def error_png(prediction: Tensor, target: Tensor, valid: Tensor) -> bytes:
     figure = Figure(figsize=(6.0, 5.2 * height / width + 0.2), dpi=110, layout="constrained")
     axes = figure.add_subplot()
     axes.set_facecolor("0.6")
-    shown = axes.imshow(error, cmap="RdBu_r", vmin=-ERROR_SPAN, vmax=ERROR_SPAN, interpolation="nearest")
+    shown = axes.imshow(error, cmap=ERROR_COLOURS, vmin=-ERROR_SPAN, vmax=ERROR_SPAN, interpolation="nearest")
     axes.set_xticks([])
     axes.set_yticks([])
     bar = figure.colorbar(shown, ax=axes, shrink=0.92, aspect=24, pad=0.02, extend="both")

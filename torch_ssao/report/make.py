@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from torch_ssao.report import html, images, plots
+from torch_ssao.report import html, images, overview, plots
+from torch_ssao.report.candidates import LAYERS
 from torch_ssao.report.environment import require
 from torch_ssao.report.measure import Measurement, measure, write_json
 from torch_ssao.report.rows import REPEATS, predict
@@ -24,8 +25,9 @@ def make_report(
     width: int = 480,
     samples: int = 512,
     fit_views: Iterable[int] = (0,),
-    layers: Sequence[int] = (1, 2, 4, 8),
-    technique: str = "statvo",
+    layers: Sequence[int] = LAYERS,
+    technique: str | Sequence[str] = "statvo",
+    options: Mapping[str, Any] | None = None,
     radius: float | None = None,
     parameters: tuple[str, ...] | None = None,
     max_evaluations: int | None = None,
@@ -33,13 +35,14 @@ def make_report(
     seed: int = 0,
     progress: bool | None = None,
 ) -> Measurement:
-    """Measure a technique on a scene and write the report.
+    """Measure techniques on a scene and write the report.
 
     Args: those of `measure`.
     Returns: the `Measurement`; `files` names what was written to `out`: what `measure` writes, and report.html
         (self-contained), speed_error.png, fitted_values.png, and for the first judged view reference.png and, for every
         model, <name>_untuned.png, <name>_fitted.png, <name>_untuned_error.png, <name>_fitted_error.png. Grey pictures
-        are visibility in linear 8-bit grey, 255 = open.
+        are visibility in linear 8-bit grey, 255 = open. Of several techniques, techniques.png shows the best of each
+        beside the reference.
     Raises: as `measure`, and MissingExtraError without the extra `report`, before any work.
     Cost: as `measure`, and about 0.3 s a picture.
     """
@@ -54,6 +57,7 @@ def make_report(
         fit_views=fit_views,
         layers=layers,
         technique=technique,
+        options=options,
         radius=radius,
         parameters=parameters,
         max_evaluations=max_evaluations,
@@ -75,6 +79,8 @@ def draw(measurement: Measurement) -> dict[str, bytes]:
     values = plots.fitted_values_png(measurement)
     if values is not None:
         pictures["fitted_values.png"] = values
+    if len(measurement.techniques) > 1:
+        pictures["techniques.png"] = overview.overview_png(measurement)
     target, valid = measurement.truth.visibility[0], measurement.truth.valid[0]
     pictures["reference.png"] = images.grey_png(target)
     for row in measurement.rows:

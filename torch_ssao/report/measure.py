@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -14,6 +14,7 @@ from torch_ssao import checks, serialize
 from torch_ssao.gbuffer import GBuffer
 from torch_ssao.modules import AmbientVisibility
 from torch_ssao.report import rows as row_tools
+from torch_ssao.report.candidates import LAYERS, candidates
 from torch_ssao.report.environment import environment, require
 from torch_ssao.report.rows import FitSummary, Row, Score
 from torch_ssao.report.truth import CEILING_SEED_STEP, Ceiling, TraceSettings, Truth, noise_ceiling, trace_views
@@ -47,7 +48,7 @@ class Measurement:
         out: folder of the files written.
         settings: size, radius, samples of the reference.
         fit_views, judged_views: indices into `scene.cameras`.
-        rows: untuned modules by layer count, then the fitted ones.
+        rows: untuned modules by technique and count, then the fitted ones.
         constant, ceiling: the two lines every error lies between.
         gbuffer, truth: of the judged views.
         environment: see `environment.environment`.
@@ -66,6 +67,11 @@ class Measurement:
     truth: Truth
     environment: dict[str, Any]
     files: tuple[str, ...]
+
+    @property
+    def techniques(self) -> tuple[str, ...]:
+        """Names in `modules.TECHNIQUES` of what was compared, each once."""
+        return tuple(dict.fromkeys(row.technique for row in self.rows))
 
     @property
     def judged_on_training_views(self) -> bool:
@@ -90,6 +96,7 @@ class Measurement:
                 "fit_views": self.fit_views,
                 "judged_views": self.judged_views,
                 "judged_on_training_views": self.judged_on_training_views,
+                "techniques": self.techniques,
                 "rows": [row.as_dict() for row in self.rows],
                 "constant": asdict(self.constant),
                 "ceiling": asdict(self.ceiling),
@@ -108,8 +115,9 @@ def measure(
     width: int = 480,
     samples: int = 512,
     fit_views: Iterable[int] = (0,),
-    layers: Sequence[int] = (1, 2, 4, 8),
-    technique: str = "statvo",
+    layers: Sequence[int] = LAYERS,
+    technique: str | Sequence[str] = "statvo",
+    options: Mapping[str, Any] | None = None,
     radius: float | None = None,
     parameters: tuple[str, ...] | None = None,
     max_evaluations: int | None = None,
@@ -117,7 +125,7 @@ def measure(
     seed: int = 0,
     progress: bool | None = None,
 ) -> Measurement:
-    """Measure a technique on a scene, untuned and fitted, against ray-traced references.
+    """Measure techniques on a scene, untuned and fitted, against ray-traced references.
 
     Args:
         scene: from `scenes.builtin` or `scenes.load`.
@@ -128,10 +136,11 @@ def measure(
         height, width: image size in pixels, at least 11 (the window of SSIM).
         samples: rays a pixel of the reference, a power of two.
         fit_views: the views to fit on.
-        layers: layer counts, each once.
-        technique: a name in `modules.TECHNIQUES`.
+        layers: layer counts, each once; of techniques that have layers.
+        technique: a name in `modules.TECHNIQUES`, or several.
+        options: counts and other choices of the techniques; see `candidates.candidates`.
         radius: scene units, of the reference and of the untuned modules; None for the scene's suggestion.
-        parameters: names to fit; None for all that the technique uses.
+        parameters: names to fit, of each technique those that it uses; None for all.
         max_evaluations: budget of each fit; None for that of `fitting.fit`.
         repeats: timed forward passes per module, at least 5.
         seed: of the reference's sampling pattern.
@@ -144,9 +153,10 @@ def measure(
     require("measure", "scenes", "trimesh", "embreex")  # before any work: without the extras nothing should be traced
     require("measure", "fitting", "optimistix")
     settings = TraceSettings(height, width, scene.radius if radius is None else radius, samples, seed)
-    modules = row_tools.candidates(technique, settings.radius, layers)
+    modules = candidates(technique, settings.radius, layers, options)
     fit_on, judged = _split_views(scene, views, fit_views)
-    _check_arguments(settings, repeats, modules[0][2], parameters, max_evaluations)
+    _check_arguments(settings, repeats)
+    _check_fits([module for *_, module in modules], parameters, max_evaluations)
     folder = checks.check_output_folder("out", out)
     return _run(_Plan(scene, folder, settings, modules, fit_on, judged, parameters, max_evaluations, repeats, progress))
 
@@ -255,7 +265,7 @@ def _fit_all(plan: _Plan, data: _Data) -> tuple[list[_Fit], tuple[str, ...]]:
             module,
             gbuffer,
             truth,
-            parameters=plan.parameters,
+            parameters=_fitted_names(module, plan.parameters),
             valid=truth.valid,
             max_evaluations=plan.max_evaluations,
             progress=plan.progress,
@@ -285,22 +295,35 @@ def _split_views(scene: Scene, views: Iterable[int] | None, fit_views: Iterable[
     return fit_on, judged or fit_on
 
 
-def _check_arguments(
-    settings: TraceSettings,
-    repeats: int,
-    module: AmbientVisibility,
-    parameters: tuple[str, ...] | None,
-    max_evaluations: int | None,
-) -> None:
+def _check_arguments(settings: TraceSettings, repeats: int) -> None:
     checks.check_count("height", settings.height, SMALLEST)
     checks.check_count("width", settings.width, SMALLEST)
     checks.check_count("samples", settings.samples, 2)
     checks.check_count("repeats", repeats, 5)
-    if max_evaluations is not None:  # two residuals with their Jacobians, the least a fit can work with
-        fitted = module.used_parameters() if parameters is None else parameters
-        checks.check_count("max_evaluations", max_evaluations, 2 * (len(fitted) + 1))
+
+
+def _check_fits(
+    modules: Sequence[AmbientVisibility], parameters: tuple[str, ...] | None, max_evaluations: int | None
+) -> None:
+    """Every name to fit is used by some module, every module has one, and the budget is enough for all of them."""
+    known = tuple(dict.fromkeys(name for module in modules for name in module.used_parameters()))
     for name in parameters or ():
-        checks.check_choice("parameters", name, module.used_parameters())
+        checks.check_choice("parameters", name, known)
+    for module in modules:
+        fitted = _fitted_names(module, parameters)
+        if not fitted:
+            used = ", ".join(module.used_parameters())
+            raise checks.ChoiceError(
+                f"parameters must name at least one of each technique, got {parameters}: add one of {type(module).__name__}'s "
+                f"{used}, or leave that technique out"
+            )
+        if max_evaluations is not None:  # two residuals with their Jacobians, the least a fit can work with
+            checks.check_count("max_evaluations", max_evaluations, 2 * (len(fitted) + 1))
+
+
+def _fitted_names(module: AmbientVisibility, parameters: tuple[str, ...] | None) -> tuple[str, ...]:
+    used = module.used_parameters()
+    return used if parameters is None else tuple(name for name in used if name in parameters)
 
 
 def _summarise(result: Any) -> FitSummary:

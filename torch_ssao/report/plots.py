@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+from torch_ssao.report.candidates import TITLES
 from torch_ssao.report.images import figure_png
 from torch_ssao.report.rows import Row
 
@@ -12,48 +13,65 @@ if TYPE_CHECKING:
     from torch_ssao.report.measure import Measurement
 
 UNTUNED, FITTED = "#b4552d", "#1f6f8b"
+COLOURS, MARKERS = ("#1f6f8b", "#b4552d", "#6b7f1f", "#7b4b94"), ("o", "s", "^", "D")
+"""Of techniques in the order of the report."""
 
 
 def speed_error_png(measurement: Measurement) -> bytes:
-    """PNG of RMSE on the judged views against milliseconds a view: untuned hollow, fitted filled, quartiles as bars."""
+    """PNG of RMSE on the judged views against milliseconds a view.
+
+    Untuned hollow, fitted filled, quartiles as bars; every technique has its own marker and, beside others, its own colour.
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.0, 4.6), dpi=120, layout="constrained")
+    several = len(measurement.techniques) > 1
+    figure = Figure(figsize=(8.4, 5.6) if several else (7.0, 4.6), dpi=120, layout="constrained")
     axes = figure.add_subplot()
-    for fitted, colour in ((False, UNTUNED), (True, FITTED)):
-        rows = [row for row in measurement.rows if row.is_fitted == fitted]
-        face = colour if fitted else "white"
-        times = [row.timing for row in rows]
-        middle = [time.median_ms for time in times]
-        spread = [[time.median_ms - time.low_ms for time in times], [time.high_ms - time.median_ms for time in times]]
-        error = [row.validation.rmse for row in rows]
-        axes.errorbar(
-            middle,
-            error,
-            xerr=spread,
-            color=colour,
-            marker="o",
-            markersize=9,
-            markerfacecolor=face,
-            markeredgewidth=1.6,
-            linewidth=1.0,
-            elinewidth=1.0,
-            capsize=2,
-            label="fitted" if fitted else "untuned",
-            zorder=3,
-        )
-        for row, x, y in zip(rows, middle, error, strict=True):
-            # The worse of a pair is labelled above and the better below, clear of each other.
-            others = [o.validation.rmse for o in measurement.rows if o.name == row.name and o is not row]
-            above = y > max(others) if others and y != others[0] else not fitted
-            shift = (0, 9) if above else (0, -16)
-            style: dict[str, Any] = {"ha": "center", "fontsize": 8, "color": colour}
-            axes.annotate(row.label, (x, y), xytext=shift, textcoords="offset points", **style)
+    for index, technique in enumerate(measurement.techniques):
+        marker, own = MARKERS[index % len(MARKERS)], COLOURS[index % len(COLOURS)]
+        for fitted in (False, True):
+            rows = [row for row in measurement.rows if row.is_fitted == fitted and row.technique == technique]
+            if not rows:
+                continue
+            state = "fitted" if fitted else "untuned"
+            colour = own if several else (FITTED if fitted else UNTUNED)
+            style = {"color": colour, "marker": marker, "markerfacecolor": colour if fitted else "white"}
+            style |= {"linestyle": "-" if fitted or not several else "--"}
+            style |= {"label": f"{TITLES.get(technique, technique)}, {state}" if several else state}
+            _draw_rows(axes, rows, style)
+            for row in rows:
+                _annotate(axes, row, measurement, colour)
     constant, ceiling = measurement.constant.validation.rmse, measurement.ceiling.rmse
     axes.axhline(constant, color="0.35", linestyle="--", linewidth=1.1, label=f"constant image, {constant:.3f}")
     axes.axhline(ceiling, color="0.35", linestyle=":", linewidth=1.3, label=f"noise of the reference, {ceiling:.4f}")
     _finish(axes, measurement)
     return figure_png(figure)
+
+
+def _draw_rows(axes: Any, rows: list[Row], style: dict[str, Any]) -> None:
+    times = [row.timing for row in rows]
+    axes.errorbar(
+        [time.median_ms for time in times],
+        [row.validation.rmse for row in rows],
+        xerr=[[time.median_ms - time.low_ms for time in times], [time.high_ms - time.median_ms for time in times]],
+        markersize=9,
+        markeredgewidth=1.6,
+        linewidth=1.0,
+        elinewidth=1.0,
+        capsize=2,
+        zorder=3,
+        **style,
+    )
+
+
+def _annotate(axes: Any, row: Row, measurement: Measurement, colour: str) -> None:
+    """The model's label; of an untuned and fitted pair the worse is labelled above and the better below."""
+    error = row.validation.rmse
+    others = [o.validation.rmse for o in measurement.rows if o.name == row.name and o is not row]
+    above = error > max(others) if others and error != others[0] else not row.is_fitted
+    style: dict[str, Any] = {"ha": "center", "fontsize": 8, "color": colour, "textcoords": "offset points"}
+    style["bbox"] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.5}
+    axes.annotate(row.label, (row.timing.median_ms, error), xytext=(0, 9) if above else (0, -16), **style)
 
 
 def _finish(axes: Any, measurement: Measurement) -> None:
@@ -73,18 +91,23 @@ def _finish(axes: Any, measurement: Measurement) -> None:
 
 
 def fitted_values_png(measurement: Measurement) -> bytes | None:
-    """PNG of each parameter's fitted value and standard error by model, with its start; None without any fit."""
+    """PNG of each used parameter's value and standard error by fitted model, with its start; None without any fit."""
     from matplotlib.figure import Figure
 
     fitted = [row for row in measurement.rows if row.fit is not None]
     if not fitted:
         return None
     start = {row.name: row.module.values() for row in measurement.rows if row.fit is None}
-    names = list(fitted[0].module.PARAMETERS)
-    figure = Figure(figsize=(7.0, 2.3 * math.ceil(len(names) / 2)), dpi=120, layout="constrained")
+    names = list(dict.fromkeys(name for row in fitted for name in row.module.used_parameters()))
+    several = len(measurement.techniques) > 1  # then labels are long, hence slanted
+    labels: dict[str, Any] = {"rotation": 20, "ha": "right", "rotation_mode": "anchor"} if several else {}
+    rows = math.ceil(len(names) / 2)
+    figure = Figure(figsize=(7.0, (2.7 if several else 2.3) * rows), dpi=120, layout="constrained")
     for index, name in enumerate(names):
-        axes = figure.add_subplot(math.ceil(len(names) / 2), 2, index + 1)
-        _draw_parameter(axes, name, fitted, start)
+        axes = figure.add_subplot(rows, 2, index + 1)
+        shown = [row for row in fitted if name in row.module.used_parameters()]
+        _draw_parameter(axes, name, shown, start)
+        axes.set_xticks(range(len(shown)), [row.label for row in shown], fontsize=8, **labels)
     return figure_png(figure)
 
 
@@ -104,7 +127,6 @@ def _draw_parameter(axes: Any, name: str, fitted: list[Row], start: dict[str, di
     axes.set_ylim(min(drawn) / 2.2, max(drawn) * 2.2)  # wide enough for two ticks however little the values differ
     _readable_ticks(axes.yaxis)
     axes.margins(x=0.15)
-    axes.set_xticks(range(len(fitted)), [row.label for row in fitted], fontsize=8)
     axes.grid(True, axis="y", which="both", color="0.9", linewidth=0.6)
 
 

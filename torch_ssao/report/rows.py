@@ -61,7 +61,7 @@ class Row:
 
     Args:
         name: unique, used in file names, such as "statvo_4".
-        label: for people, such as "4 layers".
+        label: for people, such as "4 layers" or, in the company of other techniques, "StatVO 4 layers".
         module: what was measured.
         validation: error on the judged views. training: error on the fitted views.
         timing: of one judged view.
@@ -77,45 +77,30 @@ class Row:
     fit: FitSummary | None = None
 
     @property
+    def technique(self) -> str:
+        """The module's name in `modules.TECHNIQUES`."""
+        return next(name for name, kind in TECHNIQUES.items() if isinstance(self.module, kind))
+
+    @property
     def is_fitted(self) -> bool:
         """Whether the values come from a fit."""
         return self.fit is not None
 
     def as_dict(self) -> dict[str, Any]:
         """The row as plain values for report.json."""
+        values = self.module.values()
         return {
             "name": self.name,
+            "technique": self.technique,
             "label": self.label,
             "fitted": self.is_fitted,
             "validation": asdict(self.validation),
             "training": asdict(self.training),
             "timing": asdict(self.timing),
             "choices": self.module.config(),
-            "values": self.module.values(),
+            "values": {name: values.get(name) for name in self.module.PARAMETERS},  # None is off
             "fit": None if self.fit is None else asdict(self.fit),
         }
-
-
-def candidates(technique: str, radius: float, layers: Sequence[int]) -> list[tuple[str, str, AmbientVisibility]]:
-    """Modules with default values but for the radius, one per layer count.
-
-    Args:
-        technique: a name in `modules.TECHNIQUES`.
-        radius: scene units, > 0.
-        layers: layer counts, each once; a technique that has none gives one module.
-    Returns: (name, label, module) for each.
-    Raises: ChoiceError for an unknown technique; RangeError for a radius, a layer count or a repetition that cannot be.
-    """
-    checks.check_choice("technique", technique, TECHNIQUES)
-    kind: Any = TECHNIQUES[technique]
-    if "layers" not in kind.CHOICES:
-        return [(technique, technique, kind(radius))]
-    if not layers or len(set(layers)) != len(layers):
-        raise checks.RangeError(
-            f"layers must name layer counts, each once, got {tuple(layers)}: pass (1, 2, 4, 8) or so"
-        )
-    plural = {count: "layer" if count == 1 else "layers" for count in layers}
-    return [(f"{technique}_{n}", f"{n} {plural[n]}", kind(radius, layers=n)) for n in layers]
 
 
 def predict(module: AmbientVisibility, gbuffer: GBuffer) -> Tensor:

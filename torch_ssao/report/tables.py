@@ -27,25 +27,30 @@ def score_cells(measurement: Measurement) -> list[list[str]]:
 
 
 def value_cells(measurement: Measurement) -> list[list[str]]:
-    """Rows (model, parameter, value, standard error, unit and meaning) of every fitted parameter."""
+    """Rows (model, parameter, value, standard error, unit and meaning) of every parameter in use."""
     cells = []
     for row in measurement.rows:
         if row.fit is None:
             continue
-        for name, value in row.module.values().items():
+        values = row.module.values()
+        for name in row.module.used_parameters():
+            value = values[name]
             spec = row.module.PARAMETERS[name]
             cells.append([row.label, name, f"{value:.4g}", _uncertainty(row, name), f"{spec.meaning} ({spec.unit})"])
     return cells
 
 
 def value_matrix(measurement: Measurement) -> tuple[list[str], list[list[str]]]:
-    """Head and rows of the fitted values, a model a row with one cell "value ± standard error" per parameter."""
+    """Head and rows of the fitted values, a model a row with one cell "value ± standard error" per parameter.
+
+    Parameters that no model uses are left out; "-" where a model has no such parameter or does not use it.
+    """
     fitted = [row for row in measurement.rows if row.fit is not None]
-    names = list(fitted[0].module.PARAMETERS) if fitted else []
+    names = list(dict.fromkeys(name for row in fitted for name in row.module.used_parameters()))
     cells = []
     for row in fitted:
-        values = row.module.values()
-        texts = [f"{values[name]:.4g} {_uncertainty(row, name)}" for name in names]
+        values, used = row.module.values(), row.module.used_parameters()
+        texts = [f"{values[name]:.4g} {_uncertainty(row, name)}" if name in used else "-" for name in names]
         cells.append([row.label, *(text.replace(UNDETERMINED, "(undetermined)") for text in texts)])
     return ["fitted values", *names], cells
 
