@@ -64,13 +64,13 @@ CASES = (
         *(1, "Halo: a wall 1.2 R behind a pillar", _HALO, figures.near_halo),
         meaning="largest obscurance of the wall",
         most=1e-3,
-        known={"statvo": 0.377, "bitmask": 0.148, "increments": 0.0173, "march": 0.396, "march-thick": 0.0179},
+        known={"statvo": 0.377, "bitmask": 0.325, "increments": 0.0483, "march": 0.396, "march-thick": 0.0179},
     ),
     HardCase(
         *(1, "Thin occluders: a slat 0.3 R over a floor, defaults", _HALO, figures.under_slat),
         meaning="mean error on the floor beside it",
         most=0.05,
-        known={"bitmask": -0.106, "increments": -0.0548, "march": -0.147, "march-thick": -0.0957},
+        known={"bitmask": -0.148, "increments": -0.133, "march": -0.147, "march-thick": -0.0957},
         techniques=CAPPED,
     ),
     HardCase(
@@ -119,7 +119,7 @@ CASES = (
         figure=figures.field_of_view,
         meaning="largest deviation of a band's mean from its mean over the views",
         most=0.02,
-        known={"statvo": 0.0306, "increments": 0.0207},
+        known={"statvo": 0.0306},
     ),
     HardCase(
         *(7, "Depth buffers: four conventions and logarithmic, float32", "n8ao#37, #43; three.js#10199, #32773"),
@@ -144,7 +144,7 @@ CASES = (
         *(9, "Sky over a floor: the row beyond 89 degrees, R below a pixel", _SKY, figures.horizon_row),
         meaning="largest obscurance of the floor",
         most=1e-2,
-        known={"bitmask": 0.155, "increments": 0.0137},
+        known={"bitmask": 0.155, "increments": 0.0257},
     ),
     HardCase(
         *(10, "NaN, infinite, zero, negative depth; NaN, infinite, zero, overlong normals", _NAN, figures.damage),
