@@ -163,7 +163,7 @@ class AmbientVisibility(nn.Module, abc.ABC):
             valid = gbuffer.valid_mask
             # Invalid samples get a harmless depth before any arithmetic: a NaN times a zero gradient is still NaN.
             depth = _wide(torch.where(valid, gbuffer.depth, 1.0))
-            normal = None if gbuffer.normal is None else _wide(torch.where(valid[:, :1], gbuffer.normal, 0.0))
+            normal = None if gbuffer.normal is None else _wide(_repaired(gbuffer.normal, valid[:, :1]))
             visibility = self._visibility(depth, valid, normal, gbuffer.camera, frame=frame, backend=backend)
             if self.denoise:
                 visibility = self._denoised(visibility, depth, valid, normal, gbuffer.camera)
@@ -198,6 +198,11 @@ class AmbientVisibility(nn.Module, abc.ABC):
 
 def _log(value: float) -> float:
     return math.log(value) if value > 0 else -math.inf  # exp brings 0 back
+
+
+def _repaired(normal: Tensor, seen: Tensor) -> Tensor:
+    """Zero for a normal that is not finite or not seen, with gradient 0: one such pixel must not spoil the others' gradients."""
+    return torch.where(seen & torch.isfinite(normal).all(1, keepdim=True), normal, 0.0)
 
 
 def _wide(tensor: Tensor) -> Tensor:

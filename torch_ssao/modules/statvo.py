@@ -68,7 +68,7 @@ class StatVO(AmbientVisibility):
         quadrants: bool = True,
         sat_scale: int = 1,
         gradient: str = "exact",
-        surrogate_width: float = 0.25,
+        surrogate_width: float = 0.05,
         learnable: str | tuple[str, ...] = (),
     ) -> None:
         check_choices(layers, layering, sat_scale, gradient, surrogate_width)

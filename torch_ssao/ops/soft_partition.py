@@ -1,8 +1,8 @@
 """The surrogate of StatVO's adaptive partition: a label counts as sigmoid((mean - depth) / width).
 
 Every sample belongs to every node a little: a node of membership m passes m u to its upper and m (1 - u) to its lower child, with u
-the sigmoid of how far the sample lies before the node's own mean in its window. Nothing here is discrete, so its derivative is exact;
-StatVO takes it for the derivative of the hard image.
+the sigmoid of how far the sample lies before the node's own mean in its window. Nothing here is discrete: its derivative is exact.
+StatVO takes that for the derivative of the hard image.
 """
 
 from __future__ import annotations
