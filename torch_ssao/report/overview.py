@@ -34,8 +34,8 @@ def best_of_each(measurement: Measurement) -> list[Row]:
 def overview_png(measurement: Measurement) -> bytes:
     """PNG of the first judged view, a pixel of each picture a pixel of the file (or a few, of small pictures).
 
-    Above: reference and the best model of each technique, visibility in linear grey, 255 = open, to two levels. Below: estimate minus
-    reference, red too open, blue too dark. The numbers are those of the report's table, of all judged views.
+    Above: reference and the best model of each technique, visibility in linear grey, 255 = open, to two levels. Below:
+    estimate minus reference, red too open, blue too dark. The numbers are those of the report's table, of all judged views.
     """
     from matplotlib.figure import Figure
 
