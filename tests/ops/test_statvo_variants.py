@@ -82,34 +82,59 @@ def test_surrogate_has_the_same_value_and_its_two_modes_are_transposes(
     assert (gradients["exact"][0] - gradients["surrogate"][0]).abs().max() > 1e-3  # it does something
 
 
-def test_a_wide_surrogate_of_one_decision_matches_the_soft_average() -> None:
-    """Two layers, every sample but one far from the split: moving that one across must cost what the surrogate integrates."""
-    gb = random_gbuffer(3, height=6, width=6, invalid=0.0)
-    depth = torch.where(torch.arange(6) < 3, 1.8, 2.4).double().expand(1, 1, 6, 6).clone()
-    width = 0.05
-    cotangent = torch.randn(1, 6, 6, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+def soft_obscurance(
+    points: torch.Tensor,
+    valid: torch.Tensor,
+    normal: torch.Tensor,
+    half: torch.Tensor,
+    box: float,
+    slope: float,
+    rounds: int,
+) -> torch.Tensor:
+    """One image with soft labels, every window summed pixel by pixel under plain autograd; width a quarter of the box."""
+    height, width = valid.shape[-2:]
+    v, u = (t.flatten().double() for t in torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij"))
 
-    def loss(z: torch.Tensor, gradient: str) -> torch.Tensor:
-        moved = depth.clone()
-        moved[0, 0, 2, 2] = z
-        points, valid, normal, half, box, slope = arguments(ts.GBuffer(moved, gb.camera, normal=gb.normal), radius=0.9)
-        vo = statvo_obscurance(
-            points, valid, normal, half, box, slope, layers=2, gradient=gradient, surrogate_width=width / 0.3
-        )
-        return (vo * cotangent).sum()
+    def cover(low: torch.Tensor, high: torch.Tensor, at: torch.Tensor, size: int) -> torch.Tensor:
+        low, high = low.clamp(0, size)[:, None], high.clamp(0, size)[:, None]
+        return (torch.minimum(high, at + 1) - torch.maximum(low, at)).clamp(min=0)
 
-    grid = torch.linspace(1.8, 2.4, 121, dtype=torch.float64)
-    totals = {}
-    for gradient in ("exact", "surrogate"):
-        slopes = []
-        for z in grid:
-            z = z.clone().requires_grad_()
-            slopes.append(torch.autograd.grad(loss(z, gradient), z)[0])
-        totals[gradient] = torch.trapezoid(torch.stack(slopes), grid)
-    change = loss(grid[-1], "exact") - loss(grid[0], "exact")
-    jump = change - totals["exact"]  # what the flip of the label adds
-    assert abs(jump) > 0.05
-    assert abs(change - totals["surrogate"]) < 0.35 * abs(jump)
+    reach_x, reach_y = half[0, :, 0].flatten(1)
+    area = cover(u + 0.5 - reach_x, u + 0.5 + reach_x, u, width) * cover(
+        v + 0.5 - reach_y, v + 0.5 + reach_y, v, height
+    )
+    x = points[0, :, 0].flatten(1)
+
+    def leaves(member: torch.Tensor, level: int) -> list[torch.Tensor]:
+        if level == 0:
+            return [member]
+        mean = (area @ (member * x[2])) / (area @ member)
+        upper = torch.sigmoid((mean - x[2]) / (0.25 * box))
+        return leaves(member * upper, level - 1) + leaves(member * (1 - upper), level - 1)
+
+    total, count = 0, 0
+    for member in leaves(valid.flatten().double(), rounds):
+        amount = area @ member
+        mean = (area @ (member * x).T) / amount[:, None]
+        rise = ((mean - x.T) * normal[0].flatten(1).T).sum(1) / box
+        psi = torch.where(rise > 1, (1 - slope * (rise - 1)).clamp(min=0), rise.clamp(min=0))
+        total, count = total + amount * psi, count + amount
+    return torch.where(valid.flatten(), total / count, 0.0).view(1, height, width)
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("layers", [2, 4, 8])
+def test_surrogate_is_the_gradient_of_the_soft_partition(layers: int, orthographic: bool) -> None:
+    gb = random_gbuffer(layers, height=7, width=8, orthographic=orthographic)
+    points, valid, normal, half, box, slope = arguments(gb)
+    cotangent = torch.randn(1, 7, 8, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    inputs = [tensor.clone().requires_grad_() for tensor in (points, normal, half)]
+    soft = soft_obscurance(inputs[0], valid, *inputs[1:], 0.3, 0.7, layers.bit_length() - 1)
+    expected = torch.autograd.grad((soft * cotangent).sum(), inputs)
+    hard = statvo_obscurance(inputs[0], valid, *inputs[1:], box, slope, layers=layers, gradient="surrogate")
+    for got, want in zip(torch.autograd.grad((hard * cotangent).sum(), inputs), expected, strict=True):
+        torch.testing.assert_close(got, want, atol=1e-9, rtol=1e-9)
+    assert (soft - hard).abs().max() > 1e-2  # the value stays hard
 
 
 @pytest.mark.parametrize("quadrants", [False, True])

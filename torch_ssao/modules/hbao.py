@@ -88,7 +88,7 @@ class HBAO(AmbientVisibility):
         steps: int = 4,
         weighting: str = "cosine",
         estimator: str = "bitmask",
-        thickness: float | None = 0.4,
+        thickness: float | None = 0.8,
         bias_deg: float = 0.0,
         step_power: float = 1.3,
         connected: bool = True,

@@ -71,7 +71,6 @@ def horizon_obscurance(
         thickness: (B,) of the radius, > 0; None: infinite.
         bias: (B,) radians, >= 0: elevations below it are open.
         rotation, offset: (H, W) noise in [0, 1): of the slices, in 1 / slices of half a turn; of the taps, in steps.
-        orthographic: parallel rays.
         slices, steps, step_power: taps lie at R ((k + jitter) / steps)^step_power along the slice, at least a pixel away.
         weighting: "cosine" or "uniform".
         estimator: "increments" or "bitmask".
@@ -83,8 +82,8 @@ def horizon_obscurance(
     Gradients: to depth, normal, intrinsics, radius, falloff, thickness and bias, of the expected estimate (above);
         footprint_step = 0 gives the derivative almost everywhere. Of a change of the footprint by fx and fy each takes half.
         Forward mode alike. Second derivatives raise a RuntimeError.
-    Cost: blocks of about 2^18 taps (2^21 on a GPU), one alive at a time, forward and backward; saved: the inputs and three
-        floats a pixel, whatever the taps. Backward costs about five times forward.
+    Cost: blocks of 2^18 taps (2^21 on a GPU), one alive at a time; saved: the inputs and three floats a pixel, whatever the
+        taps. Backward costs about five times forward.
     Raises: ChoiceError.
     Source: HBAO (Bavoil, Sainz, Dimitrov 2008), GTAO (Jimenez et al. 2016), visibility bitmasks (Therrien et al. 2023).
     """

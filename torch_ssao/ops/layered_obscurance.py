@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torch_ssao.ops import sat
 from torch_ssao.ops.falloff import psi
-from torch_ssao.ops.leaf_tables import Leaf, leaf_tables
+from torch_ssao.ops.leaf_tables import Leaf, leaf_tables, sample_table
 from torch_ssao.ops.partition import MIN_COUNT, ROUNDING, Samples, adaptive_labels, uniform_labels
 from torch_ssao.ops.sat import Lattice
 from torch_ssao.ops.soft_partition import SoftPartition, half_from_lines
@@ -87,20 +87,24 @@ class LayeredObscurance:
     def value(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Obscurance (B, H, W); labels (B, L, h, w); obscurance and samples of each box, (B, Q, H, W)."""
         labels = self._labels()
+        boxes, count = self._boxes(self._leaves(labels))
+        held = (count > 0).sum(1).clamp(min=1)
+        obscurance = torch.where(self.queries.seen, boxes.sum(1) / held, 0.0)
+        dtype = self.samples.position.dtype
+        return obscurance.to(dtype), labels, boxes.to(dtype), count.to(dtype)
+
+    def _boxes(self, leaves: Iterator[Leaf]) -> tuple[Tensor, Tensor]:
+        """Obscurance and samples of each box, (B, Q, H, W) float64."""
         batch, height, width = self.queries.seen.shape
-        total = torch.zeros((batch, self.cells, height, width), dtype=torch.float64, device=labels.device)
+        total = torch.zeros((batch, self.cells, height, width), dtype=torch.float64, device=self.lost.device)
         count = torch.zeros_like(total)
-        for leaf in self._leaves(labels):
+        for leaf in leaves:
             for rows, lattice in self._windows():
                 response = self._respond(sat.cell_sums(leaf.table, lattice), rows)
                 total[:, :, rows] += response.amount * response.value
                 count[:, :, rows] += response.amount
             del leaf  # before the next table is made
-        dtype = self.samples.position.dtype
-        boxes = torch.where(count > 0, total.div_(count.clamp(min=MIN_COUNT)), 0.0).clamp_(max=1)
-        held = (count > 0).sum(1).clamp(min=1)
-        obscurance = torch.where(self.queries.seen, boxes.sum(1) / held, 0.0)
-        return obscurance.to(dtype), labels, boxes.to(dtype), count.to(dtype)
+        return torch.where(count > 0, total.div_(count.clamp(min=MIN_COUNT)), 0.0).clamp_(max=1), count
 
     def _labels(self) -> Tensor:
         if self.settings.layering == "uniform":
@@ -111,6 +115,19 @@ class LayeredObscurance:
         return leaf_tables(
             self.samples, self.origin, labels, self.settings.layers, differential=self.settings.differential
         )
+
+    def _soft(self) -> SoftPartition | None:
+        if self.settings.gradient == "exact" or self.settings.layers == 1:
+            return None
+        return SoftPartition(self.samples, self.settings.layers, self.queries.width)
+
+    def _soft_boxes(self, soft: SoftPartition) -> tuple[Tensor, Tensor]:
+        dtype = self.samples.position.dtype
+        boxes, count = self._boxes(self._soft_leaf(member) for member in soft.leaves())
+        return boxes.to(dtype), count.to(dtype)
+
+    def _soft_leaf(self, member: Tensor) -> Leaf:
+        return Leaf(member, sample_table(self.samples, self.origin, member))
 
     def _windows(self, outer: slice | None = None) -> Iterator[tuple[slice, Lattice]]:
         """Blocks of rows of pixels, all or those inside `outer`, with their windows."""
@@ -166,36 +183,43 @@ class LayeredObscurance:
             grad: (B, H, W) cotangent of the obscurance; the rest as `value` returned them.
         """
         samples, queries = self.samples, self.queries
-        soft = SoftPartition(samples, self.settings.layers, queries.width) if self._is_soft() else None
-        decisions = soft.zeros() if soft else grad[:0]
         into = _Cotangents(
             samples.position.new_zeros(samples.position.shape),
             *(torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (queries.normal, queries.half)),
             *(torch.zeros_like(t, dtype=torch.float64) for t in (grad, queries.box_height, queries.slope)),
         )
-        for leaf in self._leaves(labels):
-            to_samples = self._pull_back_leaf(leaf, grad, boxes, count, into)
-            for axis in range(3):
-                moved = to_samples[:, axis, None] * samples.mass
-                into.position[:, axis] = torch.where(leaf.member, moved.to(grad.dtype), into.position[:, axis])
-            if soft:
-                soft.add_membership_cotangent(decisions, self._to_member(to_samples), soft.rounds, leaf.label)
-            del leaf, to_samples  # before the next table is made
         to_sample_half = samples.half.new_zeros((grad.shape[0], 0))
-        if soft:
-            to_depth, to_sample_half = soft.pull_back(decisions)
-            into.position[:, 2] += to_depth.to(grad.dtype)
+        if (soft := self._soft()) is None:
+            for leaf in self._leaves(labels):
+                to_samples = self._pull_back_leaf(leaf.table, grad, boxes, count, into)
+                self._pull_back_position(to_samples, leaf.member, into)
+                del leaf, to_samples  # before the next table is made
+        else:
+            boxes, count = self._soft_boxes(soft)
+
+            def pull(member: Tensor) -> Tensor:
+                to_samples = self._pull_back_leaf(self._soft_leaf(member).table, grad, boxes, count, into)
+                self._pull_back_position(to_samples, member, into)
+                return self._to_member(to_samples)
+
+            to_depth, to_sample_half = soft.pull_back(pull)
+            into.position[:, 2] += to_depth
         to_centre = (-into.rise[:, None] * queries.normal).to(grad.dtype)
         scalars = (into.box_height.to(grad.dtype), into.slope.to(grad.dtype))
         return [into.position, to_sample_half, to_centre, into.normal, into.half, *scalars]
 
-    def _pull_back_leaf(self, leaf: Leaf, grad: Tensor, boxes: Tensor, count: Tensor, into: _Cotangents) -> Tensor:
+    def _pull_back_position(self, to_samples: Tensor, member: Tensor, into: _Cotangents) -> None:
+        weight = member * self.samples.mass
+        for axis in range(3):
+            into.position[:, axis] += to_samples[:, axis, None] * weight
+
+    def _pull_back_leaf(self, table: Tensor, grad: Tensor, boxes: Tensor, count: Tensor, into: _Cotangents) -> Tensor:
         """Cotangents (B, 4, h, w) of what one layer's table was made of; those of the queries are added to `into`."""
-        to_table = torch.zeros_like(leaf.table)
+        to_table = torch.zeros_like(table)
         for outer in sat.scatter_blocks(*grad.shape[1:]):
-            to_sums = leaf.table.new_empty((*boxes.shape[:2], 4, outer.stop - outer.start, grad.shape[2]))
+            to_sums = table.new_empty((*boxes.shape[:2], 4, outer.stop - outer.start, grad.shape[2]))
             for rows, lattice in self._windows(outer):
-                response = self._respond(sat.cell_sums(leaf.table, lattice), rows)
+                response = self._respond(sat.cell_sums(table, lattice), rows)
                 sums, rise, slope = self._derivatives(response, boxes, count, rows)
                 weight = grad[:, None, rows].double()
                 inside = slice(rows.start - outer.start, rows.stop - outer.start)
@@ -206,7 +230,7 @@ class LayeredObscurance:
                 into.box_height.sub_((rise * response.height).flatten(1).sum(1))
                 into.slope.add_((slope * weight).flatten(1).sum(1))
             lattice = self._lattice(outer)
-            lines = sat.cell_sums_pull_back(to_sums, leaf.table, lattice, to_table)
+            lines = sat.cell_sums_pull_back(to_sums, table, lattice, to_table)
             into.half[:, :, outer] += half_from_lines(*lines, lattice, self.samples.size)
         return sat.summed_area_table_adjoint(to_table)
 
@@ -216,27 +240,28 @@ class LayeredObscurance:
         Args:
             tangents: by name - position, sample_half, centre, normal, half, box_height, slope; None costs nothing.
         """
-        samples, queries = self.samples, self.queries
         position, half = tangents["position"], tangents["half"]
-        soft = SoftPartition(samples, self.settings.layers, queries.width) if self._is_soft() else None
-        decisions = []
-        if soft:
-            decisions = soft.push_forward(None if position is None else position[:, 2], tangents["sample_half"])
-        total = torch.zeros_like(queries.seen, dtype=torch.float64)
-        for leaf in self._leaves(labels):
-            moving = self._moving_table(leaf, position, soft, decisions)
+        moving: Iterator[tuple[Leaf, Tensor | None]]
+        if (soft := self._soft()) is None:
+            moving = ((leaf, self._moving_table(leaf.member, position, None)) for leaf in self._leaves(labels))
+        else:
+            boxes, count = self._soft_boxes(soft)
+            pushed = soft.push_forward(None if position is None else position[:, 2], tangents["sample_half"])
+            moving = ((self._soft_leaf(m), self._moving_table(m, position, moved)) for m, moved in pushed)
+        total = torch.zeros_like(self.queries.seen, dtype=torch.float64)
+        for leaf, table in moving:
             for rows, lattice in self._windows():
                 response = self._respond(sat.cell_sums(leaf.table, lattice), rows)
                 to_sums, to_rise, to_slope = self._derivatives(response, boxes, count, rows)
                 tangent = self._own_tangent(tangents, response, to_rise, to_slope, rows)
-                if moving is not None:
-                    tangent = tangent + (sat.cell_sums(moving, lattice) * to_sums).sum((1, 2))
+                if table is not None:
+                    tangent = tangent + (sat.cell_sums(table, lattice) * to_sums).sum((1, 2))
                 if half is not None:
-                    slopes = half_from_lines(*sat.edge_slopes(to_sums, leaf.table, lattice), lattice, samples.size)
+                    slopes = half_from_lines(*sat.edge_slopes(to_sums, leaf.table, lattice), lattice, self.samples.size)
                     tangent = tangent + (slopes * half[:, :, rows]).sum(1)
                 total[:, rows] += tangent
-            del leaf, moving
-        return total.to(samples.position.dtype)
+            del leaf, table
+        return total.to(self.samples.position.dtype)
 
     def _own_tangent(
         self, tangents: dict[str, Tensor | None], response: Response, to_rise: Tensor, to_slope: Tensor, rows: slice
@@ -254,34 +279,26 @@ class LayeredObscurance:
             tangent = tangent + to_slope.sum(1) * slope[:, None, None]
         return tangent
 
-    def _moving_table(
-        self, leaf: Leaf, position: Tensor | None, soft: SoftPartition | None, decisions: list[Tensor]
-    ) -> Tensor | None:
-        """Table of the tangents of a layer's samples; None when nothing moves."""
-        if position is None and soft is None:
+    def _moving_table(self, member: Tensor, position: Tensor | None, moved: Tensor | None) -> Tensor | None:
+        """Table of the tangents of a layer's samples, from those of positions and memberships; None when nothing moves."""
+        if position is None and moved is None:
             return None
         mass = self.samples.mass.double()
-        joined = None if soft is None else mass * soft.membership_tangent(decisions, soft.rounds, leaf.label)
+        joined = mass * (0.0 if moved is None else moved)
         channels = []
         for axis in range(3):
-            moved = torch.zeros_like(mass)
+            total = joined * self._apart(axis)
             if position is not None:
-                moved += torch.where(leaf.member, position[:, axis] * mass, 0.0)
-            if joined is not None:
-                moved += joined * self._apart(axis)
-            channels.append(moved.sum(1))
-        channels.append(channels[0] * 0 if joined is None else joined.sum(1))
-        return sat.summed_area_table(torch.stack(channels, 1))
+                total += position[:, axis] * member * mass
+            channels.append(total.sum(1))
+        return sat.summed_area_table(torch.stack((*channels, joined.sum(1)), 1))
 
     def _to_member(self, to_samples: Tensor) -> Tensor:
         """(B, L, h, w) cotangent of a layer's memberships."""
         total = to_samples[:, 3, None].expand(self.samples.mass.shape).clone()
         for axis in range(3):
             total += to_samples[:, axis, None] * self._apart(axis)
-        return torch.where(self.samples.mass > 0, total * self.samples.mass, 0.0)
+        return (total * self.samples.mass).to(self.samples.position.dtype)
 
     def _apart(self, axis: int) -> Tensor:
         return self.samples.position[:, axis].double() - self.origin[:, axis, None, None, None]
-
-    def _is_soft(self) -> bool:
-        return self.settings.gradient == "surrogate" and self.settings.layers > 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from torch_ssao.ops import sat
@@ -13,9 +12,8 @@ from torch_ssao.ops.partition import Samples
 
 
 class Leaf(NamedTuple):
-    """One layer: its label, its samples (B, L, h, w) bool and its table of x, y, z (relative to the centre) and mass."""
+    """One layer: its samples (B, L, h, w), bool or memberships, and its table of x, y, z (relative to the centre) and mass."""
 
-    label: int
     member: Tensor
     table: Tensor
 
@@ -40,13 +38,13 @@ def leaf_tables(samples: Samples, centre: Tensor, labels: Tensor, layers: int, *
         return
     for label in range(layers):
         member = kept & (labels == label)
-        yield Leaf(label, member, sample_table(samples, centre, member))
+        yield Leaf(member, sample_table(samples, centre, member))
 
 
 def sample_table(samples: Samples, centre: Tensor, member: Tensor) -> Tensor:
     """(B, 4, h + 1, w + 1) table of the members' positions relative to the centre and of their mass, summed over the L images."""
     table = sat.empty_table(samples.position, channels=4)
-    weight = torch.where(member, samples.mass, 0).double()
+    weight = member.double() * samples.mass
     for axis in range(3):
         apart = samples.position[:, axis].double() - centre[:, axis, None, None, None]
         table[:, axis, 1:, 1:] = apart.mul_(weight).sum(1)
@@ -59,7 +57,7 @@ def _descend(
 ) -> Iterator[Leaf]:
     """The leaves below a node that holds the labels first ... first + count - 1; the node's table is used up."""
     if count == 1:
-        yield Leaf(first, (samples.mass > 0) & (labels == first), table)
+        yield Leaf((samples.mass > 0) & (labels == first), table)
         return
     half = count // 2
     inside = (samples.mass > 0) & (labels >= first) & (labels < first + half)

@@ -112,35 +112,26 @@ class Partition:
 
     def labels(self, rounds: int) -> Tensor:
         """(B, L, h, w) uint8 labels of all samples after so many rounds."""
-        return self.paths(rounds, with_siblings=False)[0]
-
-    def paths(self, rounds: int, *, with_siblings: bool) -> Tensor:
-        """Labels and, with siblings, where each sample would have gone had one round decided otherwise.
-
-        Returns: (1 or 1 + rounds, B, L, h, w) uint8: the labels; then for each round the label at the end of the path that takes
-            the other child there and follows the sample's own depth from then on.
-        """
-        kept = self.kept
-        paths = torch.zeros((1 + rounds * with_siblings, *kept.shape), dtype=torch.uint8, device=kept.device)
+        labels = torch.zeros(self.kept.shape, dtype=torch.uint8, device=self.kept.device)
         for level in range(rounds):
-            children = torch.zeros_like(paths)
+            children = torch.zeros_like(labels)
+            old, new = labels.flatten(1, 2), children.flatten(1, 2)
             for node in range(2**level):
-                table = self.table(kept & (paths[0] == node))
-                for rows, mean, count in self.means(table):
+                for rows, mean, count in self.means(self.table(self.kept & (labels == node))):
                     lower = self._is_lower(rows, mean, count)
-                    for path, child in zip(paths[: 1 + level], children, strict=False):
-                        old, new = path.flatten(1, 2)[:, rows], child.flatten(1, 2)
-                        new[:, rows] = torch.where(old == node, 2 * node + lower, new[:, rows])
-            if with_siblings:
-                children[1 + level] = children[0] ^ 1
-            paths = children
-        return paths
+                    new[:, rows] = torch.where(old[:, rows] == node, 2 * node + lower, new[:, rows])
+            labels = children
+        return labels
 
     def table(self, member: Tensor) -> Tensor:
-        """Two-channel table of a node: depth relative to the centre, and mass."""
+        """Two-channel table of a node: depth relative to the centre, and mass.
+
+        Args:
+            member: (B, L, h, w) bool, or memberships between 0 and 1.
+        """
         samples = self.samples
         table = sat.empty_table(samples.position, channels=2)
-        weight = torch.where(member, samples.mass, 0).double()
+        weight = member.double() * samples.mass
         table[:, 1, 1:, 1:] = weight.sum(1)
         table[:, 0, 1:, 1:] = weight.mul_(samples.position[:, 2].double() - self.centre).sum(1)
         return sat.accumulate(table)
