@@ -11,6 +11,7 @@ demo: $(STAMP)
 		--max-evaluations 60 --out out/demo
 	@echo "open out/demo/report.html"
 
+# The README's picture.
 docs/demo.png: demo
 	cp out/demo/techniques.png $@
 

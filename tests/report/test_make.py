@@ -163,7 +163,9 @@ def test_the_overview_holds_reference_and_best_fits_pixel_by_pixel(compared: Mea
     for column, image in enumerate(shown):
         left = overview.GAP + column * (48 * zoom + overview.GAP)
         there = picture[overview.HEAD :, left:][: 36 * zoom, : 48 * zoom][zoom // 2 :: zoom, zoom // 2 :: zoom]
-        assert np.abs(there - 255 * image.numpy()).max() <= 1.5
+        assert (
+            np.abs(there - 255 * image.numpy()).max() <= 2.1
+        )  # matplotlib rounds down, and the palette has every other level
 
 
 def test_every_technique_has_its_marker_in_the_plot(compared: Measurement, monkeypatch: pytest.MonkeyPatch) -> None:

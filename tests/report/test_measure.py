@@ -135,6 +135,7 @@ def test_several_techniques_are_measured_on_the_same_views(tmp_path: Path) -> No
             checks.RangeError,
             "max_evaluations must be a whole number at least 10",
         ),
+        ({"technique": "hbao", "options": {"thickness": 20.0}}, checks.RangeError, "thickness must start between"),
         ({"options": {"rays": 2}}, checks.ChoiceError, "options must be of statvo .* got 'rays'"),
         ({"max_evaluations": 3}, checks.RangeError, "max_evaluations must be a whole number at least 10"),
         ({"height": 10}, checks.RangeError, "height must be a whole number at least 11"),

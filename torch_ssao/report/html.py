@@ -53,7 +53,11 @@ def page(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
         _scores(measurement),
         _score_notes(measurement),
         f"<h2>Pictures, view {measurement.judged_views[0]}</h2>",
-        _picture(pictures, "techniques.png", "The best fitted model of each technique beside the reference."),
+        _picture(
+            pictures,
+            "techniques.png",
+            "The reference and of each technique the fitted model of least error on the judged views.",
+        ),
         _gallery(measurement, pictures),
         "<h2>Fitted values</h2>",
         _values(measurement, pictures),

@@ -305,7 +305,9 @@ def _check_arguments(settings: TraceSettings, repeats: int) -> None:
 def _check_fits(
     modules: Sequence[AmbientVisibility], parameters: tuple[str, ...] | None, max_evaluations: int | None
 ) -> None:
-    """Every name to fit is used by some module, every module has one, and the budget is enough for all of them."""
+    """Every name to fit is used by some module, every module has one and starts in range, and the budget is enough."""
+    from torch_ssao.fitting.parameters import ParameterSpace
+
     known = tuple(dict.fromkeys(name for module in modules for name in module.used_parameters()))
     for name in parameters or ():
         checks.check_choice("parameters", name, known)
@@ -317,6 +319,7 @@ def _check_fits(
                 f"parameters must name at least one of each technique, got {parameters}: add one of {type(module).__name__}'s "
                 f"{used}, or leave that technique out"
             )
+        ParameterSpace.of(module, fitted)  # told now, not after tracing
         if max_evaluations is not None:  # two residuals with their Jacobians, the least a fit can work with
             checks.check_count("max_evaluations", max_evaluations, 2 * (len(fitted) + 1))
 

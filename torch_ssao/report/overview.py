@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 DPI = 100
 GAP, HEAD = 8, 34
 """Pixels between pictures, and above them for two lines of text."""
+GREYS, ERRORS = 128, 65
+"""Colours of the file, at most 256."""
 LEAST = 200
 """Pixels: smaller pictures are enlarged by a whole number, or the text over them would not fit."""
 
@@ -31,8 +34,8 @@ def best_of_each(measurement: Measurement) -> list[Row]:
 def overview_png(measurement: Measurement) -> bytes:
     """PNG of the first judged view, a pixel of each picture a pixel of the file (or a few, of small pictures).
 
-    Above: reference and the best model of each technique, visibility in linear grey, 255 = open. Below: estimate minus
-    reference, red too open, blue too dark. The numbers are those of the report's table, of all judged views.
+    Above: reference and the best model of each technique, visibility in linear grey, 255 = open, to two levels. Below:
+    estimate minus reference, red too open, blue too dark. The numbers are those of the report's table, of all judged views.
     """
     from matplotlib.figure import Figure
 
@@ -64,7 +67,26 @@ def overview_png(measurement: Measurement) -> bytes:
         axes = place(GAP + column * (width + GAP), HEAD + GAP + height, width, height)
         _show_error(axes, np.where(valid, image - target, np.nan))
     _show_bar(place(GAP + 0.12 * width, HEAD + GAP + 1.5 * height, 0.76 * width, 10))
-    return figure_png(figure)
+    return _with_palette(figure_png(figure))
+
+
+def _with_palette(content: bytes) -> bytes:
+    """The PNG with `GREYS` greys and `ERRORS` error colours: a third of the size, and grey is off by two levels at most."""
+    from matplotlib import colormaps
+    from PIL import Image
+
+    grey = np.linspace(0, 255, GREYS)[:, None].repeat(3, 1)
+    colours = 255 * colormaps[ERROR_COLOURS](np.linspace(0, 1, ERRORS))[:, :3]
+    palette = np.rint(np.concatenate((grey, colours)))
+    pixels = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"))
+    used, where = np.unique(pixels.reshape(-1, 3), axis=0, return_inverse=True)
+    # Pillow's own matching is approximate: white would become a light grey.
+    nearest = ((used[:, None].astype(float) - palette) ** 2).sum(2).argmin(1).astype(np.uint8)
+    picture = Image.fromarray(nearest[where.reshape(pixels.shape[:2])], "P")
+    picture.putpalette(palette.astype(np.uint8).tobytes())
+    buffer = io.BytesIO()
+    picture.save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
 
 
 def _show_error(axes: Any, error: np.ndarray) -> None:

@@ -69,7 +69,7 @@ def _annotate(axes: Any, row: Row, measurement: Measurement, colour: str) -> Non
     error = row.validation.rmse
     others = [o.validation.rmse for o in measurement.rows if o.name == row.name and o is not row]
     above = error > max(others) if others and error != others[0] else not row.is_fitted
-    style: dict[str, Any] = {"ha": "center", "fontsize": 8, "color": colour, "textcoords": "offset points"}
+    style: dict[str, Any] = {"ha": "center", "fontsize": 8, "color": colour, "textcoords": "offset points", "zorder": 4}
     style["bbox"] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.5}
     axes.annotate(row.label, (row.timing.median_ms, error), xytext=(0, 9) if above else (0, -16), **style)
 
