@@ -41,15 +41,11 @@ def precisions() -> list[Any]:
     params = []
     for scene in SCENES:
         for name in TECHNIQUES:
-            # NaN normals at valid pixels: StatVO's derivatives are NaN, pinned in `damage`.
-            broken = scene == "damaged" and name == "statvo"
-            why = pytest.mark.xfail(strict=True, reason="StatVO does not repair normals that are not finite")
             for dtype in (*FULL, *HALF):
                 params.append(
                     pytest.param(
                         *(scene, name, dtype),
                         id=f"{scene}-{name}-{str(dtype).removeprefix('torch.')}",
-                        marks=why if broken else (),
                     )
                 )
     return params

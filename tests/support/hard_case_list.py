@@ -150,7 +150,6 @@ CASES = (
         *(10, "NaN, infinite, zero, negative depth; NaN, infinite, zero, overlong normals", _NAN, figures.damage),
         meaning="values outside [0, 1] and derivatives that are not finite",
         most=0,
-        known={"statvo": 2779},
     ),
     HardCase(
         *(10, "Normals of length 0.8 and 1.25", _NAN, figures.normal_length),
