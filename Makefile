@@ -26,8 +26,13 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Every table and figure of docs/statvo.md and docs/stability.md, about an hour; each also runs on its own.
 bench: $(STAMP)
-	$(BIN)/python -m benchmarks.statvo
+	$(BIN)/python -m benchmarks.statvo_precision
+	$(BIN)/python -m benchmarks.statvo_speed
+	$(BIN)/python -m benchmarks.statvo_claims
+	$(BIN)/python -m benchmarks.statvo_surrogate
+	$(BIN)/python -m benchmarks.stability
 
 # torch first and pinned, so that no other package pulls a build with gigabytes of CUDA libraries.
 $(STAMP): pyproject.toml constraints.txt

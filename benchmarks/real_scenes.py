@@ -20,7 +20,6 @@ from typing import Any
 import torch
 
 import torch_ssao as ts
-from benchmarks.windows import TwoWindows
 from torch_ssao.modules import AmbientVisibility
 from torch_ssao.report.environment import environment
 from torch_ssao.scenes.scene import Scene
@@ -35,7 +34,7 @@ MODELS: dict[str, tuple[Callable[[float], AmbientVisibility], tuple[str, ...] | 
     "one region": (lambda r: ts.StatVO(r, layers=4, quadrants=False), None, 300),
     "quadrants": (lambda r: ts.StatVO(r, layers=4, quadrants=True), None, 300),
     "quadrants, 8 layers": (lambda r: ts.StatVO(r, layers=8, quadrants=True), None, 300),
-    "quadrants, two windows": (lambda r: TwoWindows(r, layers=4), None, 300),
+    "quadrants, two windows": (lambda r: ts.StatVO(r, layers=4, windows=2), None, 300),
 }
 
 

@@ -132,3 +132,14 @@ def test_bad_configuration(arguments: dict, error: type[Exception], message: str
 def test_unknown_backend() -> None:
     with pytest.raises(checks.ChoiceError, match="backend must be one of"):
         ts.StatVO()(steps_gbuffer(), backend="cuda")
+
+
+def test_two_windows_are_the_weighted_mean_of_two_modules() -> None:
+    gb = steps_gbuffer(height=20, width=24, dtype=torch.float64)
+    outer, inner = (1 - ts.StatVO(radius, layers=4).double()(gb) for radius in (0.8, 0.2))
+    both = ts.StatVO(0.8, layers=4, windows=2, inner_radius=0.25, inner_weight=3.0, learnable="all").double()
+    torch.testing.assert_close(both(gb), 1 - (outer + 3 * inner) / 4, atol=1e-6, rtol=0)
+    assert set(both.learnable) == set(both.PARAMETERS)
+    assert "inner_radius" not in ts.StatVO(learnable="all").learnable
+    with pytest.raises(ts.checks.ChoiceError, match="windows"):
+        ts.StatVO(windows=3)

@@ -60,7 +60,14 @@ def test_surrogate_has_the_same_value_and_its_two_modes_are_transposes(
 
     def f(gradient: str, *inputs: torch.Tensor) -> torch.Tensor:
         return statvo_obscurance(
-            inputs[0], valid, *inputs[1:], layers=layers, sat_scale=sat_scale, gradient=gradient, quadrants=layers == 4
+            inputs[0],
+            valid,
+            *inputs[1:],
+            layers=layers,
+            sat_scale=sat_scale,
+            gradient=gradient,
+            surrogate_width=0.25,
+            quadrants=layers == 4,
         )
 
     leaves = [tensor.clone().requires_grad_() for tensor in inputs]
@@ -131,7 +138,9 @@ def test_surrogate_is_the_gradient_of_the_soft_partition(layers: int, orthograph
     inputs = [tensor.clone().requires_grad_() for tensor in (points, normal, half)]
     soft = soft_obscurance(inputs[0], valid, *inputs[1:], 0.3, 0.7, layers.bit_length() - 1)
     expected = torch.autograd.grad((soft * cotangent).sum(), inputs)
-    hard = statvo_obscurance(inputs[0], valid, *inputs[1:], box, slope, layers=layers, gradient="surrogate")
+    hard = statvo_obscurance(
+        inputs[0], valid, *inputs[1:], box, slope, layers=layers, gradient="surrogate", surrogate_width=0.25
+    )
     for got, want in zip(torch.autograd.grad((hard * cotangent).sum(), inputs), expected, strict=True):
         torch.testing.assert_close(got, want, atol=1e-9, rtol=1e-9)
     assert (soft - hard).abs().max() > 1e-2  # the value stays hard
@@ -148,12 +157,15 @@ def test_differential_tables_give_the_same_image(layers: int, quadrants: bool) -
     torch.testing.assert_close(direct, differential, atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("variant", [{}, {"sat_scale": 2}, {"layering": "uniform"}, {"gradient": "surrogate"}], ids=str)
+VMAPPED = [{}, {"sat_scale": 2}, {"layering": "uniform"}, {"gradient": "surrogate"}, {"windows": 2}]
+
+
+@pytest.mark.parametrize("variant", VMAPPED, ids=str)
 def test_vmap_and_jacfwd_agree_with_loops(variant: dict[str, Any]) -> None:
     gb = random_gbuffer(8, batch=3, height=6, width=7)
     net = ts.StatVO(0.45, layers=4, learnable="all", **variant).double()
     torch.testing.assert_close(vmap(net)(gb), net(gb), atol=1e-12, rtol=0)
-    names = [f"raw_{name}" for name in net.PARAMETERS]
+    names = [f"raw_{name}" for name in net.used_parameters()]
     raw = torch.stack([getattr(net, name).detach() for name in names])
 
     def f(raw: torch.Tensor) -> torch.Tensor:

@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 import torch
 
+import torch_ssao as ts
+
 from support.reports import TINY, corner, fake_fit
 from torch_ssao import checks, fitting, load, reference, scenes
 from torch_ssao.report import Measurement, measure
@@ -51,7 +53,7 @@ def test_untuned_rows_come_first_and_differ_from_the_default_in_the_radius_alone
         ("statvo_2", True),
     ]
     for row in measured.rows[:2]:
-        assert row.module.values() == pytest.approx({"radius": 0.5, "height": 1.0, "falloff": 1.0, "contrast": 1.0})
+        assert row.module.values() == pytest.approx(ts.StatVO(0.5).values())
 
 
 def test_constant_and_ceiling(measured: Measurement) -> None:

@@ -31,6 +31,10 @@ class StatVO(AmbientVisibility):
         gradient: "exact" (almost everywhere: layers are constants) or "surrogate" (adaptive: a sample moves between layers
             like sigmoid((mean - depth) / width)); the image is the same.
         surrogate_width: width of that sigmoid, of the box height, > 0.
+        windows: 1, or 2: average the obscurance of a second, smaller window into it. Costs twice, and is worth 0.5 to 0.9 dB
+            on real meshes (docs/statvo.md).
+        inner_radius: radius of the second window, of the radius, > 0. Its box is as many times smaller in all directions.
+        inner_weight: weight of the second window over that of the first, > 0.
         learnable: names of the parameters to register as `nn.Parameter`s, or "all"; the rest are buffers.
     Raises:
         RangeError, ChoiceError.
@@ -42,17 +46,22 @@ class StatVO(AmbientVisibility):
         "height": ParameterSpec("of the radius", 1e-2, 1e2, "height of the sample box over the surface"),
         "falloff": ParameterSpec("1", 1e-2, 1e2, "slope of psi above the box"),
         "contrast": ParameterSpec("1", 1e-2, 1e2, "exponent of the visibility"),
+        "inner_radius": ParameterSpec("of the radius", 1 / 32, 1.0, "half-size of the second sample box"),
+        "inner_weight": ParameterSpec("1", 1e-2, 1e2, "weight of the second window over that of the first"),
     }
-    CHOICES = ("layers", "layering", "quadrants", "sat_scale", "gradient", "surrogate_width")
+    CHOICES = ("layers", "layering", "quadrants", "sat_scale", "windows", "gradient", "surrogate_width")
 
     radius = Positive()
     height = Positive()
     falloff = Positive()
+    inner_radius = Positive()
+    inner_weight = Positive()
 
     layers: int
     layering: str
     quadrants: bool
     sat_scale: int
+    windows: int
     gradient: str
     surrogate_width: float
 
@@ -67,18 +76,30 @@ class StatVO(AmbientVisibility):
         layering: str = "adaptive",
         quadrants: bool = True,
         sat_scale: int = 1,
+        windows: int = 1,
+        inner_radius: float = 1 / 3,
+        inner_weight: float = 1.0,
         gradient: str = "exact",
         surrogate_width: float = 0.05,
         learnable: str | tuple[str, ...] = (),
     ) -> None:
         check_choices(layers, layering, sat_scale, gradient, surrogate_width)
         checks.check_choice("quadrants", quadrants, (False, True))
-        values = {"radius": radius, "height": height, "falloff": falloff, "contrast": contrast}
+        checks.check_choice("windows", windows, (1, 2))
+        values = {
+            "radius": radius,
+            "height": height,
+            "falloff": falloff,
+            "contrast": contrast,
+            "inner_radius": inner_radius,
+            "inner_weight": inner_weight,
+        }
         choices = {
             "layers": layers,
             "layering": layering,
             "quadrants": quadrants,
             "sat_scale": sat_scale,
+            "windows": windows,
             "gradient": gradient,
             "surrogate_width": surrogate_width,
         }
@@ -87,18 +108,35 @@ class StatVO(AmbientVisibility):
     def _visibility(
         self, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera, *, frame: int, backend: str
     ) -> Tensor:
-        batch = depth.shape[0]
-        radius, height, falloff = (value.to(depth.dtype) for value in (self.radius, self.height, self.falloff))
         points = camera.unproject(depth)
         if normal is None:
-            normal = depth.new_tensor([0.0, 0.0, -1.0]).view(1, 3, 1, 1).expand(batch, 3, *depth.shape[2:])
-        obscurance = statvo_obscurance(
+            front = depth.new_tensor([0.0, 0.0, -1.0]).view(1, 3, 1, 1)
+            normal = front.expand(depth.shape[0], 3, *depth.shape[2:])
+        radius = self.radius.to(depth.dtype)
+        obscurance = self._obscurance(points, valid, normal, camera, radius)
+        if self.windows == 2:
+            weight = self.inner_weight.to(depth.dtype)
+            inner = self._obscurance(points, valid, normal, camera, radius * self.inner_radius.to(depth.dtype))
+            obscurance = (obscurance + weight * inner) / (1 + weight)
+        return 1 - obscurance
+
+    def _obscurance(self, points: Tensor, valid: Tensor, normal: Tensor, camera: Camera, radius: Tensor) -> Tensor:
+        """Obscurance of one window size."""
+        batch, dtype = points.shape[0], points.dtype
+        return statvo_obscurance(
             points,
             valid,
             normal,
-            camera.footprint(radius, depth),
-            (radius * height).expand(batch),
-            falloff.expand(batch),
-            **self.config(),
+            camera.footprint(radius, points[:, 2]),
+            (radius * self.height.to(dtype)).expand(batch),
+            self.falloff.to(dtype).expand(batch),
+            layers=self.layers,
+            layering=self.layering,
+            quadrants=self.quadrants,
+            sat_scale=self.sat_scale,
+            gradient=self.gradient,
+            surrogate_width=self.surrogate_width,
         )
-        return 1 - obscurance
+
+    def _unused_parameters(self) -> tuple[str, ...]:
+        return () if self.windows == 2 else ("inner_radius", "inner_weight")
