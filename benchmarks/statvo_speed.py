@@ -20,7 +20,7 @@ import torch
 import torch_ssao as ts
 from benchmarks.statvo_memory import peak_bytes
 from benchmarks.timing import interleaved, shown
-from torch_ssao.ops import sat
+from torch_ssao.ops import sat, statvo_obscurance
 from torch_ssao.report.environment import environment
 
 SCENES = ("temple", "street")
@@ -217,6 +217,32 @@ def gradient(options: argparse.Namespace) -> tuple[list[Row], list[Row]]:
     return rows, [{"what": "surrogate / exact, forward and backward", "ratio": value, "paper": None}]
 
 
+def differential(options: argparse.Namespace) -> tuple[list[Row], list[Row]]:
+    """time and rounding with half of the layers' tables made by subtraction against all of them built"""
+    width, height = options.size
+    gbuffer, radius = view("temple", width, height)
+    depth = torch.where(gbuffer.valid_mask, gbuffer.depth, 1.0)
+    half = gbuffer.camera.footprint(torch.tensor(radius), depth)
+    box, slope = torch.full((1,), radius), torch.ones(1)
+    inputs = (gbuffer.camera.unproject(depth), gbuffer.valid_mask, gbuffer.normal, half, box, slope)
+    rows, ratios = [], []
+    for n in (4, 16):
+        works = {
+            (how,): functools.partial(statvo_obscurance, *inputs, layers=n, differential=how) for how in (False, True)
+        }
+        found = compare(works, ("differential",), width * height, options.repeats, layers=n)
+        rows += found
+        ratios.append(
+            {
+                "what": "differential / direct",
+                "layers": n,
+                "ratio": ratio(found, {"differential": True}, {"differential": False}),
+                "largest_difference": float((works[(True,)]() - works[(False,)]()).abs().max()),
+            }
+        )
+    return rows, ratios
+
+
 def pair(
     options: argparse.Namespace, name: str, values: tuple[Any, ...], modes: tuple[str, ...], **common: Any
 ) -> list[Row]:
@@ -227,7 +253,9 @@ def pair(
     return compare(works, (name, "mode"), width * height, options.repeats, **common)
 
 
-PARTS = {part.__name__: part for part in (layers, memory, footprints, scales, quadrants, layering, gradient)}
+PARTS = {
+    part.__name__: part for part in (layers, memory, footprints, scales, quadrants, layering, gradient, differential)
+}
 
 
 def show(name: str, rows: list[Row], ratios: list[Row]) -> None:
