@@ -8,7 +8,6 @@ import pytest
 import torch
 
 import torch_ssao as ts
-
 from support.reports import TINY, corner, fake_fit
 from torch_ssao import checks, fitting, load, reference, scenes
 from torch_ssao.report import Measurement, measure
