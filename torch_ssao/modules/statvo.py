@@ -80,7 +80,7 @@ class StatVO(AmbientVisibility):
         inner_radius: float = 1 / 3,
         inner_weight: float = 1.0,
         gradient: str = "exact",
-        surrogate_width: float = 0.05,
+        surrogate_width: float = 0.1,
         learnable: str | tuple[str, ...] = (),
     ) -> None:
         check_choices(layers, layering, sat_scale, gradient, surrogate_width)

@@ -24,7 +24,7 @@ def statvo_obscurance(
     sat_scale: int = 1,
     differential: bool = False,
     gradient: str = "exact",
-    surrogate_width: float = 0.05,
+    surrogate_width: float = 0.1,
 ) -> Tensor:
     """Obscurance of every pixel from the mean position of each layer in its window.
 
