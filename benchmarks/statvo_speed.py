@@ -116,23 +116,23 @@ def memory(options: argparse.Namespace) -> tuple[list[Row], list[Row]]:
         for cut in (False, True)
         for mode in MODES
     }
-    rows = compare(
-        works, ("layers", "quadrants", "mode"), width * height, options.large_repeats, width=width, height=height
-    )
+    names, common = ("layers", "quadrants", "mode"), {"width": width, "height": height}
+    if options.large_repeats:
+        rows = compare(works, names, width * height, options.large_repeats, **common)
+    else:
+        rows = [common | dict(zip(names, key, strict=True)) for key in works if key[2] == "forward_backward"]
     for row in rows:
         choices = PLAIN | {"layers": row["layers"], "quadrants": row["quadrants"]}
         row["bytes_per_pixel"] = round(peak_bytes(gbuffer, radius, choices, row["mode"]) / (width * height), 1)
     ratios = [
         {
-            "what": f"bytes of {LAYERS[-1]} layers / {LAYERS[0]} layer",
+            "what": f"bytes of {LAYERS[-1]} layers / 2 layers",
             "quadrants": cut,
             "mode": mode,
-            "ratio": ratio(
-                rows, {"layers": LAYERS[-1]}, {"layers": LAYERS[0]}, "bytes_per_pixel", quadrants=cut, mode=mode
-            ),
+            "ratio": ratio(rows, {"layers": LAYERS[-1]}, {"layers": 2}, "bytes_per_pixel", quadrants=cut, mode=mode),
         }
         for cut in (False, True)
-        for mode in MODES
+        for mode in dict.fromkeys(row["mode"] for row in rows)
     ]
     return rows, ratios
 
@@ -263,7 +263,7 @@ def show(name: str, rows: list[Row], ratios: list[Row]) -> None:
     hidden = ("median_ms", "min_ms", "max_ms", "repeats")
     for row in rows:
         what = "  ".join(f"{key}={value}" for key, value in row.items() if key not in hidden)
-        print(f"  {shown(row):>28} ms  {what}")
+        print(f"  {shown(row) if 'median_ms' in row else '':>28} ms  {what}")
     for row in ratios:
         print("  " + "  ".join(f"{key}={value}" for key, value in row.items() if value is not None))
 
@@ -277,7 +277,7 @@ def main() -> None:
     parser.add_argument(
         "--large", type=int, nargs=2, default=(1920, 1080), metavar=("WIDTH", "HEIGHT"), help="of memory"
     )
-    parser.add_argument("--large-repeats", type=int, default=3, help="of memory")
+    parser.add_argument("--large-repeats", type=int, default=3, help="of memory; 0: bytes only, no times")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/statvo_speed.json"))
     options = parser.parse_args()
     chosen = options.parts or list(PARTS)
