@@ -15,8 +15,9 @@ demo: $(STAMP)
 docs/demo.png: demo
 	cp out/demo/techniques.png $@
 
+# One process a core and one thread a process: small images gain nothing from more.
 test: $(STAMP)
-	$(BIN)/python -m pytest -q
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 8
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow
