@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .PHONY: demo test test-slow lint bench clean
 
 demo: $(STAMP)
-	$(BIN)/torch-ssao report heap --technique all --layers 1,4 --size 240x180 --samples 256 --fit-views 0,1 \
+	OMP_NUM_THREADS=1 $(BIN)/torch-ssao report heap --technique all --layers 1,4 --size 240x180 --samples 256 --fit-views 0,1 \
 		--max-evaluations 60 --out out/demo
 	@echo "open out/demo/report.html"
 

@@ -117,8 +117,11 @@ def main() -> None:
                 ),
                 flush=True,
             )
+            kept = json.loads(RESULTS.read_text(encoding="utf-8"))["rows"] if RESULTS.exists() else []
+            done = {(row["scene"], row["width"]) for row in rows}
+            rows_now = rows + [row for row in kept if (row["scene"], row["width"]) not in done]
             RESULTS.write_text(
-                json.dumps({"environment": environment(), "rows": rows}, indent=1) + "\n", encoding="utf-8"
+                json.dumps({"environment": environment(), "rows": rows_now}, indent=1) + "\n", encoding="utf-8"
             )
 
 
