@@ -157,6 +157,13 @@ def test_differential_tables_give_the_same_image(layers: int, quadrants: bool) -
     torch.testing.assert_close(direct, differential, atol=1e-9, rtol=0)
 
 
+def test_differential_tables_need_a_tree() -> None:
+    with pytest.raises(ts.checks.ChoiceError, match="differential"):
+        statvo_obscurance(
+            *arguments(random_gbuffer(4, height=5, width=6)), layers=3, layering="uniform", differential=True
+        )
+
+
 VMAPPED = [{}, {"sat_scale": 2}, {"layering": "uniform"}, {"gradient": "surrogate"}, {"windows": 2}]
 
 

@@ -59,6 +59,8 @@ def statvo_obscurance(
     Source: Statistical Volumetric Obscurance, Eqs. 3-7, Secs. 4 to 7.
     """
     check_choices(layers, layering, sat_scale, gradient, surrogate_width)
+    if differential and layering != "adaptive":
+        raise checks.ChoiceError("differential must be False with uniform layers, got True: their tables form no tree")
     samples = (points, valid, half) if sat_scale == 1 else _blocks(points, valid, half, sat_scale)
     queries = (points[:, :, 0], normal, valid[:, 0], half[:, :, 0])
     scalars = (box_height, slope, (surrogate_width * box_height).detach())
