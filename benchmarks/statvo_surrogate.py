@@ -104,7 +104,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="*", default=list(ts.scenes.names()))
     parser.add_argument("--widths", nargs="*", type=float, default=[DEFAULT_WIDTH])
-    parser.add_argument("--seeds", nargs="*", type=int, default=list(range(8)))
+    parser.add_argument("--seeds", nargs="*", type=int, default=list(range(16)))
     arguments = parser.parse_args()
     rows = []
     for width in arguments.widths:
