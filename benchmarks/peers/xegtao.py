@@ -1,4 +1,4 @@
-"""Intel's XeGTAO as an estimator on tensors: what a renderer's horizon search, tuned by hand, reaches. Forward only.
+"""Intel's XeGTAO as an estimator on tensors: what a renderer's horizon search, tuned by hand or fitted, reaches.
 
 Written from the formulae: the slice integral of Jimenez et al. 2016 (eq. 5 to 7) with XeGTAO's horizon falloff, sample
 distribution, final power and presets. Left out: the spatial denoiser, bent normals, half precision (and its larger
@@ -12,10 +12,11 @@ from typing import final
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from torch_ssao import checks
-from torch_ssao.gbuffer import GBuffer
+from torch_ssao.camera import Camera
+from torch_ssao.modules.base import AmbientVisibility, ParameterSpec, Positive
 from torch_ssao.ops.sampling import GOLDEN, tiled_noise
 
 PRESETS = {"low": (1, 2), "medium": (2, 2), "high": (3, 3), "ultra": (9, 3)}  # slices, steps a side
@@ -26,8 +27,8 @@ _SKY = 1e5  # of the radius: the depth of pixels without a surface
 
 
 @final
-class XeGTAO(nn.Module):
-    """Ground-truth-style ambient occlusion as XeGTAO computes it.
+class XeGTAO(AmbientVisibility):
+    """Ground-truth-style ambient occlusion as XeGTAO computes it: a module, so that it is fitted as ours are.
 
     Args:
         radius: of the ray-traced reference that it approximates, scene units.
@@ -41,7 +42,27 @@ class XeGTAO(nn.Module):
         thin_occluder: share by which depth differences are stretched in the falloff, so that thin things matter less.
         depth_mips: far taps read coarser levels of the depth.
         mip_offset: log2 of the pixels from which coarser levels are read.
+        contrast, denoise: of this library, after all that is XeGTAO's; 1 and 0 leave it.
+    Gradients: to the parameters, almost everywhere: what a fit needs.
+    Raises: ShapeError in forward for a G-buffer without normals.
     """
+
+    PARAMETERS = {
+        "radius": ParameterSpec(
+            "scene units", 0.25, 4.0, "of the reference, before the multiplier", relative_bounds=True
+        ),
+        "falloff_range": ParameterSpec("1", 0.05, 1.0, "share of the reach over which horizons sink"),
+        "distribution_power": ParameterSpec("1", 0.5, 4.0, "how taps crowd towards the centre"),
+        "final_power": ParameterSpec("1", 0.3, 5.0, "exponent of the estimate"),
+        "thin_occluder": ParameterSpec("1", 1e-2, 4.0, "stretch of depth differences", may_be_zero=True),
+        "contrast": ParameterSpec("1", 1e-2, 1e2, "exponent of the visibility"),
+    }
+    CHOICES = ("slices", "steps", "radius_multiplier", "floor", "fudge", "depth_mips", "mip_offset", "denoise")
+
+    falloff_range = Positive()
+    distribution_power = Positive()
+    final_power = Positive()
+    thin_occluder = Positive()
 
     def __init__(
         self,
@@ -58,42 +79,48 @@ class XeGTAO(nn.Module):
         thin_occluder: float = 0.0,
         depth_mips: bool = False,
         mip_offset: float = 3.30,
+        contrast: float = 1.0,
+        denoise: int = 0,
+        learnable: str | tuple[str, ...] = (),
     ) -> None:
-        super().__init__()
-        for name, value in (
-            ("radius", radius),
-            ("radius_multiplier", radius_multiplier),
-            ("falloff_range", falloff_range),
-            ("distribution_power", distribution_power),
-            ("final_power", final_power),
-        ):
-            checks.check_positive(name, value)
+        checks.check_positive("radius_multiplier", radius_multiplier)
         checks.check_count("slices", slices, 1)
         checks.check_count("steps", steps, 1)
-        self.radius, self.radius_multiplier, self.falloff_range = radius, radius_multiplier, falloff_range
-        self.slices, self.steps, self.distribution_power = slices, steps, distribution_power
-        self.final_power, self.floor, self.fudge, self.thin_occluder = final_power, floor, fudge, thin_occluder
-        self.depth_mips, self.mip_offset = depth_mips, mip_offset
+        values = {
+            "radius": radius,
+            "falloff_range": falloff_range,
+            "distribution_power": distribution_power,
+            "final_power": final_power,
+            "thin_occluder": thin_occluder,
+            "contrast": contrast,
+        }
+        choices = {
+            "slices": slices,
+            "steps": steps,
+            "radius_multiplier": radius_multiplier,
+            "floor": floor,
+            "fudge": fudge,
+            "depth_mips": depth_mips,
+            "mip_offset": mip_offset,
+            "denoise": denoise,
+        }
+        super().__init__(values, choices, learnable)
 
-    @torch.no_grad()
-    def forward(self, gbuffer: GBuffer, *, frame: int = 0) -> Tensor:
-        """Visibility (B, 1, H, W), 1 at invalid pixels; `frame` offsets the noise.
-
-        Raises: ShapeError for a G-buffer without normals.
-        """
-        if gbuffer.normal is None:
+    def _visibility(
+        self, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera, *, frame: int, backend: str
+    ) -> Tensor:
+        if normal is None:
             raise checks.ShapeError("gbuffer must have normals, got none: use GBuffer.from_depth, or pass them")
-        pixels = _Pixels(
-            gbuffer, gbuffer.normal, self.radius * self.radius_multiplier, self.depth_mips, self.mip_offset
-        )
-        rotation, offset = tiled_noise(*pixels.size, frame, dtype=pixels.depth.dtype, device=pixels.depth.device)
+        reach = (self.radius * self.radius_multiplier).to(depth.dtype)
+        pixels = _Pixels(depth[:, 0], valid[:, 0], normal, camera, reach, self.depth_mips, self.mip_offset)
+        rotation, offset = tiled_noise(*pixels.size, frame, dtype=depth.dtype, device=depth.device)
         total = 0.5 * ((10.0 - pixels.reach) / 100.0).clamp(0.0, 1.0)
         for number in range(self.slices):
             total = total + self._slice(pixels, number, (number + rotation) * (math.pi / self.slices), offset)
-        visibility = (total / self.slices).clamp_min(0.0) ** self.final_power
+        visibility = (total / self.slices).clamp_min(1e-6) ** self.final_power.to(depth.dtype)
         if self.floor is not None:
             visibility = visibility.clamp_min(self.floor)
-        return torch.where(gbuffer.valid_mask[:, 0], visibility.clamp_max(1.0), 1.0)[:, None]
+        return visibility.clamp_max(1.0)
 
     def _slice(self, pixels: _Pixels, number: int, azimuth: Tensor, offset: Tensor) -> Tensor:
         """Visible share of one slice (B, H, W), times the projected normal's length."""
@@ -111,7 +138,8 @@ class XeGTAO(nn.Module):
             horizon = lowest = (gamma + side * 0.5 * math.pi).cos()
             for step in range(self.steps):
                 noise = torch.frac(offset + (number + step * self.steps) * GOLDEN)
-                share = ((step + noise) / self.steps) ** self.distribution_power + _NEAREST / pixels.reach
+                power = self.distribution_power.to(pixels.depth.dtype)
+                share = ((step + noise) / self.steps) ** power + _NEAREST / pixels.reach
                 away = share * pixels.reach
                 delta, seen = pixels.tap(side * away * x, side * away * y, away)
                 found = self._faded(delta, seen, pixels, lowest)
@@ -122,10 +150,10 @@ class XeGTAO(nn.Module):
 
     def _faded(self, delta: Tensor, seen: Tensor, pixels: _Pixels, lowest: Tensor) -> Tensor:
         """Horizon cosine of a tap, drawn to the tangent plane's as it leaves the radius."""
-        stretch = delta.new_tensor((1.0, 1.0, 1.0 + self.thin_occluder))
-        distance = torch.linalg.vector_norm(delta * stretch, dim=-1)
-        full = self.radius * self.radius_multiplier
-        kept = ((full - distance) / (full * self.falloff_range)).clamp(0.0, 1.0) * seen
+        stretched = delta[..., 2:] * (1.0 + self.thin_occluder.to(delta.dtype))
+        distance = torch.linalg.vector_norm(torch.cat((delta[..., :2], stretched), -1), dim=-1)
+        full = (self.radius * self.radius_multiplier).to(delta.dtype)
+        kept = ((full - distance) / (full * self.falloff_range.to(delta.dtype))).clamp(0.0, 1.0) * seen
         cosine = (_dot(delta, pixels.view) / torch.linalg.vector_norm(delta, dim=-1, keepdim=True).clamp_min(1e-12))[
             ..., 0
         ]
@@ -133,13 +161,28 @@ class XeGTAO(nn.Module):
 
 
 class _Pixels:
-    """Positions, view vectors and normals (B, H, W, 3) of a G-buffer's nearest layer, its reach in pixels, and taps."""
+    """Positions, view vectors and normals (B, H, W, 3), reach in pixels, and taps.
 
-    def __init__(self, gbuffer: GBuffer, normal: Tensor, reach: float, mips: bool, mip_offset: float) -> None:
-        self.camera, self.mip_offset = gbuffer.camera, mip_offset
-        self.size = (gbuffer.camera.height, gbuffer.camera.width)
-        depth = torch.where(gbuffer.valid_mask[:, 0], gbuffer.depth[:, 0], _SKY * reach)
-        self.sky = 0.5 * _SKY * reach
+    Args:
+        depth: (B, H, W) view-space z. valid: (B, H, W) bool. normal: (B, 3, H, W).
+        reach: of the taps, scene units.
+        mips, mip_offset: see `XeGTAO`.
+    """
+
+    def __init__(
+        self,
+        depth: Tensor,
+        valid: Tensor,
+        normal: Tensor,
+        camera: Camera,
+        reach: Tensor,
+        mips: bool,
+        mip_offset: float,
+    ) -> None:
+        self.camera, self.mip_offset = camera, mip_offset
+        self.size = (camera.height, camera.width)
+        depth = torch.where(valid, depth, _SKY * reach.detach())
+        self.sky = 0.5 * _SKY * reach.detach()
         self.depth = depth
         self.levels = [depth]
         while mips and len(self.levels) < _LEVELS and min(self.levels[-1].shape[1:]) > 1:
