@@ -52,7 +52,7 @@ class XeGTAO(AmbientVisibility):
             "scene units", 0.25, 4.0, "of the reference, before the multiplier", relative_bounds=True
         ),
         "falloff_range": ParameterSpec("1", 0.05, 1.0, "share of the reach over which horizons sink"),
-        "distribution_power": ParameterSpec("1", 0.5, 4.0, "how taps crowd towards the centre"),
+        "distribution_power": ParameterSpec("1", 0.5, 8.0, "how taps crowd towards the centre"),
         "final_power": ParameterSpec("1", 0.3, 5.0, "exponent of the estimate"),
         "thin_occluder": ParameterSpec("1", 1e-2, 4.0, "stretch of depth differences", may_be_zero=True),
         "contrast": ParameterSpec("1", 1e-2, 1e2, "exponent of the visibility"),

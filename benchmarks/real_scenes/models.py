@@ -1,0 +1,131 @@
+"""What is fitted on the first view of a scene and judged on its others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch_ssao as ts
+from benchmarks.peers.xegtao import PRESETS, XeGTAO
+from torch_ssao.modules import AmbientVisibility
+
+
+@dataclass(frozen=True)
+class Model:
+    """A technique with its counts.
+
+    Args:
+        make: a module at the scene's radius.
+        parameters: to fit; None for all that are used; empty for as it comes.
+        evaluations: budget of the fit.
+        like: name of the model whose fitted values it takes over, instead of a fit of its own: what HBAO and the ray march
+            estimate does not depend on the number of taps.
+        full_size: fitted at the size it is judged at. For techniques whose constants are pixels.
+        taps: depth reads a pixel; 0 where it is not taps that it is made of.
+    """
+
+    make: Callable[[float], AmbientVisibility]
+    parameters: tuple[str, ...] | None = None
+    evaluations: int = 300
+    like: str | None = None
+    full_size: bool = False
+    taps: int = 0
+
+
+def _statvo(layers: int = 4, *, quadrants: bool = True, windows: int = 1) -> Callable[[float], AmbientVisibility]:
+    return lambda radius: ts.StatVO(radius, layers=layers, quadrants=quadrants, windows=windows)
+
+
+STATVO = {
+    "one layer, radius and contrast": Model(_statvo(1, quadrants=False), ("radius", "contrast"), 100),
+    "one region, radius and contrast": Model(_statvo(quadrants=False), ("radius", "contrast"), 100),
+    "one region": Model(_statvo(quadrants=False)),
+    "quadrants": Model(_statvo()),
+    "quadrants, 8 layers": Model(_statvo(8)),
+    "quadrants, two windows": Model(_statvo(windows=2)),
+}
+
+BITMASK = ("radius", "thickness", "contrast")
+INCREMENTS = ("radius", "falloff", "thickness", "contrast")
+XEGTAO = ("radius", "falloff_range", "distribution_power", "final_power", "thin_occluder")
+
+
+def _bitmask(slices: int, steps: int, *, offscreen: str = "extend", like: str | None = None) -> Model:
+    return Model(
+        lambda radius: ts.HBAO(radius, slices=slices, steps=steps, offscreen=offscreen, denoise=1),
+        *(BITMASK, 120, like),
+        taps=2 * slices * steps,
+    )
+
+
+def _increments(slices: int, steps: int, like: str | None = None) -> Model:
+    return Model(
+        lambda radius: ts.HBAO(
+            radius, estimator="increments", slices=slices, steps=steps, offscreen="extend", denoise=1
+        ),
+        *(INCREMENTS, 160, like),
+        taps=2 * slices * steps,
+    )
+
+
+def _classic(slices: int, steps: int) -> Model:
+    return Model(
+        lambda radius: ts.HBAO(
+            radius,
+            estimator="increments",
+            weighting="uniform",
+            falloff=2.0,
+            thickness=None,
+            bias_deg=5.0,
+            slices=slices,
+            steps=steps,
+            offscreen="extend",
+            denoise=1,
+        ),
+        ("radius", "falloff", "bias_deg", "contrast"),
+        160,
+        taps=2 * slices * steps,
+    )
+
+
+def _rays(rays: int, steps: int, like: str | None = None) -> Model:
+    return Model(
+        lambda radius: ts.RayMarchedSSAO(radius, rays=rays, steps=steps, thickness=0.4, falloff=8.0, denoise=1),
+        *(("radius", "thickness", "contrast"), 120, like),
+        taps=rays * steps,
+    )
+
+
+def _xegtao(preset: str, *, tuned: bool) -> Model:
+    slices, steps = PRESETS[preset]
+    return Model(
+        lambda radius: XeGTAO(radius, slices=slices, steps=steps, thin_occluder=0.1 if tuned else 0.0, denoise=1),
+        XEGTAO if tuned else (),
+        200,
+        full_size=True,
+        taps=2 * slices * steps,
+    )
+
+
+TECHNIQUES = {
+    "StatVO 4 layers": Model(_statvo()),
+    "HBAO bitmask 3x3": _bitmask(3, 3),
+    "HBAO bitmask 2x8": _bitmask(2, 8),
+    "HBAO bitmask 2x8, open border": _bitmask(2, 8, offscreen="open"),
+    "HBAO bitmask 4x8": _bitmask(4, 8, like="HBAO bitmask 2x8"),
+    "HBAO bitmask 2x16": _bitmask(2, 16, like="HBAO bitmask 2x8"),
+    "HBAO bitmask 8x16": _bitmask(8, 16, like="HBAO bitmask 2x8"),
+    "HBAO increments 3x3": _increments(3, 3),
+    "HBAO increments 2x8": _increments(2, 8),
+    "HBAO increments 4x8": _increments(4, 8, like="HBAO increments 2x8"),
+    "HBAO classic 4x4": _classic(4, 4),
+    "ray march 16x8": _rays(16, 8),
+    "ray march 8x8": _rays(8, 8, like="ray march 16x8"),
+    "ray march 32x16": _rays(32, 16, like="ray march 16x8"),
+    "XeGTAO High, shipped": _xegtao("high", tuned=False),
+    "XeGTAO High, tuned": _xegtao("high", tuned=True),
+    "XeGTAO Ultra, tuned": _xegtao("ultra", tuned=True),
+}
+
+GROUPS = {"statvo": STATVO, "techniques": TECHNIQUES}
+MODELS = STATVO | TECHNIQUES
