@@ -50,9 +50,11 @@ INCREMENTS = ("radius", "falloff", "thickness", "contrast")
 XEGTAO = ("radius", "falloff_range", "distribution_power", "final_power", "thin_occluder")
 
 
-def _bitmask(slices: int, steps: int, *, offscreen: str = "extend", like: str | None = None) -> Model:
+def _bitmask(
+    slices: int, steps: int, *, connected: bool = False, offscreen: str = "extend", like: str | None = None
+) -> Model:
     return Model(
-        lambda radius: ts.HBAO(radius, slices=slices, steps=steps, offscreen=offscreen, denoise=1),
+        lambda radius: ts.HBAO(radius, slices=slices, steps=steps, connected=connected, offscreen=offscreen, denoise=1),
         *(BITMASK, 120, like),
         taps=2 * slices * steps,
     )
@@ -109,9 +111,11 @@ def _xegtao(preset: str, *, tuned: bool) -> Model:
 
 TECHNIQUES = {
     "StatVO 4 layers": Model(_statvo()),
-    "HBAO bitmask 3x3": _bitmask(3, 3),
+    "HBAO bitmask 3x3, connected": _bitmask(3, 3, connected=True),
     "HBAO bitmask 2x8": _bitmask(2, 8),
-    "HBAO bitmask 2x8, open border": _bitmask(2, 8, offscreen="open"),
+    "HBAO bitmask 2x8, connected": _bitmask(2, 8, connected=True, like="HBAO bitmask 2x8"),
+    "HBAO bitmask 2x8, open border": _bitmask(2, 8, offscreen="open", like="HBAO bitmask 2x8"),
+    "HBAO bitmask 4x4": _bitmask(4, 4, like="HBAO bitmask 2x8"),
     "HBAO bitmask 4x8": _bitmask(4, 8, like="HBAO bitmask 2x8"),
     "HBAO bitmask 2x16": _bitmask(2, 16, like="HBAO bitmask 2x8"),
     "HBAO bitmask 8x16": _bitmask(8, 16, like="HBAO bitmask 2x8"),
