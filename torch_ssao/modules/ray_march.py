@@ -98,7 +98,7 @@ class RayMarchedSSAO(AmbientVisibility):
         radius, falloff = (value.to(depth.dtype).expand(batch) for value in (self.radius, self.falloff))
         thickness = None if self.thickness is None else self.thickness.to(depth.dtype).expand(batch)
         intrinsics = torch.stack((camera.fx, camera.fy, camera.cx, camera.cy), 1).to(depth.dtype)
-        nearest = _repaired(normal) if normal is not None else normals_from_points(points[:, :, 0], valid[:, 0])
+        nearest = normals_from_points(points[:, :, 0], valid[:, 0]) if normal is None else normal
         deeper = [normals_from_points(points[:, :, layer], valid[:, layer]) for layer in range(1, layers)]
         return ray_march_visibility(
             points,
@@ -125,11 +125,3 @@ class RayMarchedSSAO(AmbientVisibility):
         focal = torch.maximum(camera.fx, camera.fy).to(depth.dtype)[:, None, None]
         scale = 1.0 if camera.is_orthographic else depth
         return torch.minimum(reach, self.max_radius_px * scale / focal)
-
-
-def _repaired(normal: Tensor) -> Tensor:
-    """Unit normals; where one is not finite or zero, one that faces the eye, without gradient."""
-    length = torch.linalg.vector_norm(torch.nan_to_num(normal.detach(), nan=0.0, posinf=0.0, neginf=0.0), dim=1)
-    usable = (torch.isfinite(normal).all(1) & (length > 1e-6) & torch.isfinite(length))[:, None]
-    facing = normal.new_tensor([0.0, 0.0, -1.0]).view(1, 3, 1, 1)
-    return torch.nn.functional.normalize(torch.where(usable, normal, facing), dim=1)
