@@ -1,7 +1,7 @@
 """Peak memory of HBAO and the ray march, forward and backward, at 1920 x 1080: `python -m benchmarks.memory`.
 
-Every row runs in a process of its own. `rss_bytes_per_pixel` is the growth of the peak resident set over the pass - G-buffer, module
-and cotangent in place, a small pass done - less the image and the gradients of depth and normals (20 bytes a pixel).
+Every row runs in its own process. `rss_bytes_per_pixel` is the growth of the peak resident set over the pass (G-buffer, module
+and cotangent in place, a small pass done) less the image and the gradients of depth and normals (20 bytes a pixel).
 `tensor_bytes_per_pixel` (with --tensors, for as long again) is the same of what torch's CPU allocator hands out. The bound is
 20 times the 16 bytes a pixel of the G-buffer. Rows go to benchmarks/results/memory.json, beside earlier ones. Linux only.
 """

@@ -27,7 +27,8 @@ class RayMarchedSSAO(AmbientVisibility):
         contrast: exponent of the visibility, > 0.
         rays: rays a pixel, >= 1.
         steps: steps a ray, >= 1, uniform.
-        thickness: how far solids reach behind their last known surface, of the radius, > 0; None: for ever.
+        thickness: how far solids reach behind their last known surface, of the radius, > 0; None: for ever. The default is the
+            best of benchmarks/results/default_thickness.json at the default falloff; it is the parameter to fit.
         gradient: "exact", "surrogate" or "soft"; see `ops.ray_march`. With "exact" the gradient to
             thickness is 0.
         surrogate_width: width of the sigmoid of "surrogate" and "soft", of the radius, > 0.
@@ -65,7 +66,7 @@ class RayMarchedSSAO(AmbientVisibility):
         contrast: float = 1.0,
         rays: int = 16,
         steps: int = 8,
-        thickness: float | None = None,
+        thickness: float | None = 0.5,
         gradient: str = "exact",
         surrogate_width: float = 0.05,
         max_radius_px: float | None = None,
