@@ -269,6 +269,7 @@ SCENES: dict[str, tuple[Callable[[], ts.GBuffer], float]] = {
     "far plane": (lambda: scenes.far_plane(normals=True), 750.0),
     "horizon": (lambda: scenes.horizon(limit=100.0), 0.5),
     "damaged": (scenes.damaged, 0.5),
+    "absurd": (scenes.absurd, 0.5),
     "grazing": (lambda: scenes.quantised_plane(85.0), 0.5),
     "facets": (scenes.facets, 0.5),
     "near": (scenes.steps, 400.0),
