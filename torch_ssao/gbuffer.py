@@ -161,7 +161,8 @@ class GBuffer:
 
 def _usable(depth: Tensor) -> Tensor:
     farthest = FARTHEST.get(depth.dtype, FARTHEST_FLOAT32)
-    return (depth >= 1 / farthest) & (depth <= farthest)  # NaN is neither
+    # float16 rounds both limits, to 0 and infinity: it has neither depth.
+    return torch.isfinite(depth) & (depth > 0) & (depth >= 1 / farthest) & (depth <= farthest)
 
 
 def collate(items: Sequence[Any]) -> Any:

@@ -67,3 +67,9 @@ def test_depths_beyond_the_limits_are_invalid(dtype: torch.dtype, most: float) -
     assert replace(gb, depth=depth, valid=None).to(dtype).valid_mask.flatten().tolist()[::4] == [True, True]
     built = ts.GBuffer(depth.to(dtype), gb.camera)
     assert built.valid_mask.flatten().tolist() == [True, False, True, False, True]
+
+
+def test_float16_has_neither_limit_and_still_no_zero_and_no_infinity() -> None:
+    gb = plane_gbuffer(0.0, height=1, width=4, dtype=torch.float64)
+    depth = torch.tensor([0.0, torch.inf, 6e-8, 65504.0], dtype=torch.float16).view(1, 1, 1, 4)
+    assert ts.GBuffer(depth, gb.camera).valid_mask.flatten().tolist() == [False, False, True, True]
