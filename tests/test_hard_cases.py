@@ -80,7 +80,7 @@ def test_halo_just_beyond_the_radius_has_a_remedy(name: str, remedy: dict[str, A
     assert bool((make(name, 1.0, **remedy)(pillar(0.5))[gb.depth == 6.0] < 0.99).any())  # not by seeing nothing
 
 
-@pytest.mark.parametrize("name", ["march", "march-thick"])
+@pytest.mark.parametrize("name", ["march", "march-solid"])
 def test_rays_see_no_facets_with_normals_estimated_from_the_depth(name: str) -> None:
     gb = facets()
     assert gb.normal is not None

@@ -14,6 +14,10 @@ from torch_ssao import checks
 from torch_ssao.camera import Camera
 from torch_ssao.ops.normals import normals_from_points
 
+# Surfaces have depths between 1 / FARTHEST and FARTHEST: beyond, products of depths, or of their inverses, that the techniques
+# take leave the range of the dtype they compute in. In float32 that was seen from 1e15 on, in float64 from 1e150.
+FARTHEST = {torch.float64: 1e100}
+FARTHEST_FLOAT32 = 1e12  # and for what is computed in float32
 _TENSORS = ("depth", "normal", "valid", "triangles")
 
 
@@ -23,9 +27,11 @@ class GBuffer:
 
     Args:
         depth: (B, L, H, W) view-space z in scene units, floating point; `depth[:, 0]` is the nearest surface, deeper
-            layers follow. Pixels with z <= 0, inf or NaN are invalid.
+            layers follow. Pixels with z <= 0, inf or NaN are invalid, and those that no surface has: z > 1e12 or z < 1e-12
+            (float64: 1e100, 1e-100), where arithmetic overflows. Clear depth buffers to infinity all the same.
         camera: `Camera` of batch B or 1, with the image size H x W.
-        normal: (B, 3, H, W) unit view-space normals towards the eye, dtype of depth; None: view-aligned only.
+        normal: (B, 3, H, W) unit view-space normals towards the eye, dtype of depth (the techniques make them unit, as
+            interpolation does not leave them); None: view-aligned only.
         valid: (B, L, H, W) bool, further pixels to leave out (sky, transparency); None keeps all with a usable depth.
         triangles: (B, 3, 3, H, W) vertices of the visible triangle (vertex, xyz), for triangle-buffer techniques.
 
@@ -65,7 +71,7 @@ class GBuffer:
                 raise checks.DtypeError(
                     f"{name} must have depth's dtype {self.depth.dtype}, got {tensor.dtype}: convert one of them"
                 )
-        usable = torch.isfinite(self.depth) & (self.depth > 0)
+        usable = _usable(self.depth)
         if self.valid is not None:
             checks.check_shape("valid", self.valid, self.depth.shape, "one flag per depth sample")
             if self.valid.dtype != torch.bool:
@@ -103,7 +109,7 @@ class GBuffer:
     def valid_mask(self) -> Tensor:
         """(B, L, H, W) bool: usable depth and not masked out."""
         if self.valid is None:  # only while __post_init__ runs, or for a record that vmap rebuilt without one
-            return torch.isfinite(self.depth) & (self.depth > 0)
+            return _usable(self.depth)
         return self.valid
 
     def __len__(self) -> int:
@@ -151,6 +157,12 @@ class GBuffer:
     def _map(self, function: Any, camera: Camera) -> GBuffer:
         changed = {n: function(getattr(self, n)) for n in _TENSORS if getattr(self, n) is not None}
         return replace(self, camera=camera, **changed)
+
+
+def _usable(depth: Tensor) -> Tensor:
+    farthest = FARTHEST.get(depth.dtype, FARTHEST_FLOAT32)
+    # float16 rounds both limits, to 0 and infinity: it has neither depth.
+    return torch.isfinite(depth) & (depth > 0) & (depth >= 1 / farthest) & (depth <= farthest)
 
 
 def collate(items: Sequence[Any]) -> Any:

@@ -31,8 +31,8 @@ def gbuffer() -> ts.GBuffer:
         ("hbao", {}, ("radius", "contrast", "thickness")),
         ("hbao", {"thickness": None, "estimator": "increments"}, ("radius", "falloff", "contrast")),
         ("hbao", {"thickness": None, "bias_deg": 5.0}, ("radius", "contrast", "bias_deg")),
-        ("ray_march", {}, ("radius", "falloff", "contrast")),
-        ("ray_march", {"thickness": 0.5}, ("radius", "falloff", "thickness", "contrast")),
+        ("ray_march", {"thickness": None}, ("radius", "falloff", "contrast")),
+        ("ray_march", {}, ("radius", "falloff", "thickness", "contrast")),
     ],
 )
 def test_all_used_parameters_are_fitted_and_what_is_off_stays_off(

@@ -15,9 +15,10 @@ from torch_ssao import checks
 
 def test_parameters_are_fixed_by_default_and_learnable_on_request() -> None:
     assert list(ts.RayMarchedSSAO().parameters()) == []
-    every = ts.RayMarchedSSAO(thickness=0.5, learnable="all")
+    every = ts.RayMarchedSSAO(learnable="all")
     assert every.learnable == ("radius", "falloff", "thickness", "contrast")
-    assert ts.RayMarchedSSAO(learnable="all").learnable == ("radius", "falloff", "contrast")  # no thickness to learn
+    solid = ts.RayMarchedSSAO(thickness=None, learnable="all")
+    assert solid.learnable == ("radius", "falloff", "contrast")  # no thickness to learn
     net = ts.RayMarchedSSAO(thickness=0.5, gradient="surrogate", learnable=("radius", "thickness"))
     net(steps_gbuffer()).mean().backward()
     assert net.raw_radius.grad != 0
@@ -25,7 +26,8 @@ def test_parameters_are_fixed_by_default_and_learnable_on_request() -> None:
 
 
 def test_thickness_reads_none_and_numbers() -> None:
-    net = ts.RayMarchedSSAO()
+    assert ts.RayMarchedSSAO().thickness.item() == pytest.approx(0.5)
+    net = ts.RayMarchedSSAO(thickness=None)
     assert net.thickness is None
     assert "thickness" not in net.values()
     blocked = net(steps_gbuffer())
@@ -38,8 +40,9 @@ def test_thickness_reads_none_and_numbers() -> None:
 
 def test_repr_names_values_and_choices() -> None:
     text = repr(ts.RayMarchedSSAO(0.25, rays=4, max_radius_px=90.0))
-    for part in ("radius=0.25", "rays=4", "steps=8", "gradient='exact'", "max_radius_px=90.0", "thickness=None"):
+    for part in ("radius=0.25", "rays=4", "steps=8", "gradient='exact'", "max_radius_px=90.0", "thickness=0.5"):
         assert part in text
+    assert "thickness=None" in repr(ts.RayMarchedSSAO(thickness=None))
 
 
 @pytest.mark.parametrize("thickness", [None, 0.4])
@@ -136,7 +139,7 @@ def test_non_contiguous_and_expanded_input() -> None:
         ({"gradient": "none"}, checks.ChoiceError, "gradient must be one of"),
         ({"surrogate_width": 0.0}, checks.RangeError, "surrogate_width must be"),
         ({"max_radius_px": 0.0}, checks.RangeError, "max_radius_px must be"),
-        ({"learnable": "thickness"}, checks.ChoiceError, "learnable must be one of"),
+        ({"thickness": None, "learnable": "thickness"}, checks.ChoiceError, "learnable must be one of"),
     ],
 )
 def test_bad_configuration(arguments: dict, error: type[Exception], message: str) -> None:

@@ -10,7 +10,7 @@ Source: "Poisson-based ray-marched SSAO", Algorithm 1, Eqs. 1 and 2.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -20,6 +20,8 @@ Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
 FLATTEST: Final = 0.02  # smallest cosine between a stored plane's normal and the ray to the eye
+UNSUPPORTED: Final = 0.2  # the same where the depth around the sample does not show such a slope
+LEEWAY: Final = 1.5  # of the slope that the depth shows
 ROUNDING_EPSILONS: Final = 8.0
 
 
@@ -36,6 +38,7 @@ class Image:
     falloff: float
     thickness: float | None
     eps: float
+    flattest: dict[tuple[int, int, int], float] = field(default_factory=dict)  # of planes asked for already
 
 
 def hemisphere_direction(point: Floats, turn: float, outwards: float, normal: Floats) -> Floats:
@@ -69,12 +72,43 @@ def pixel_of(image: Image, place: Floats) -> tuple[int, int] | None:
     return math.floor(row), math.floor(column)
 
 
+def shown_slope(image: Image, layer: int, pixel: tuple[int, int], axis: int) -> float | None:
+    """Smaller of the changes of 1/z (parallel rays: z) to the two neighbours along an axis; None without a valid one."""
+
+    def level(at: tuple[int, int]) -> float:
+        z = float(image.positions[(layer, *at)][2])
+        return z if image.orthographic else 1.0 / z
+
+    size, found = image.valid.shape[1 + axis], []
+    for step in (-1, 1):
+        other = (pixel[0] + step, pixel[1]) if axis == 0 else (pixel[0], pixel[1] + step)
+        if 0 <= other[axis] < size and image.valid[(layer, *other)]:
+            found.append(abs(level(other) - level(pixel)))
+    return min(found, default=None)
+
+
+def flattest_plane(image: Image, layer: int, pixel: tuple[int, int]) -> float:
+    """Smallest cosine to the view ray that the depth around a sample allows its plane."""
+    key = (layer, *pixel)
+    if key not in image.flattest:
+        down, right = (shown_slope(image, layer, pixel, axis) for axis in (0, 1))
+        sample, normal = image.positions[key], image.normals[key]
+        allowed = FLATTEST
+        if down is not None and right is not None:
+            claimed = abs(normal[0]) / image.camera[0] + abs(normal[1]) / image.camera[1]
+            shown = LEEWAY * (down + right) * (1.0 if image.orthographic else float(np.linalg.norm(sample)))
+            allowed = UNSUPPORTED if claimed >= UNSUPPORTED * shown else max(FLATTEST, claimed / shown)
+        image.flattest[key] = allowed
+    return image.flattest[key]
+
+
 def depth_behind(image: Image, place: Floats, layer: int, pixel: tuple[int, int]) -> tuple[float, float]:
     """Depth of a position behind the tangent plane of a sample, along its own view ray; and its height over it."""
     sample, normal = image.positions[(layer, *pixel)], image.normals[(layer, *pixel)]
     ray = np.array([0.0, 0.0, 1.0]) if image.orthographic else sample / np.linalg.norm(sample)
-    if normal @ ray > -FLATTEST:  # tilt the plane until it faces the eye enough
-        normal = normal - (normal @ ray + FLATTEST) * ray
+    least = flattest_plane(image, layer, pixel)
+    if normal @ ray > -least:  # tilt the plane until it faces the eye enough
+        normal = normal - (normal @ ray + least) * ray
     height = float(normal @ place) - float(normal @ sample)
     through = np.array([0.0, 0.0, 1.0]) if image.orthographic else place / place[2]
     return height / min(float(normal @ through), -0.5 * FLATTEST), height

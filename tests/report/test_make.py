@@ -144,11 +144,11 @@ def test_each_technique_shows_the_parameters_it_uses(compared: Measurement) -> N
         "StatVO 1 layer": ["thickness"],
         "StatVO 2 layers": ["thickness"],
         "HBAO 2x2": ["height", "falloff"],
-        "ray march 2x2": ["height", "thickness"],
+        "ray march 2x2": ["height"],
     }
     listed = {(line[0], line[1]) for line in tables.value_cells(compared)}
-    assert ("HBAO 2x2", "thickness") in listed
-    assert not {("HBAO 2x2", "bias_deg"), ("HBAO 2x2", "falloff"), ("ray march 2x2", "thickness")} & listed
+    assert {("HBAO 2x2", "thickness"), ("ray march 2x2", "thickness")} <= listed
+    assert not {("HBAO 2x2", "bias_deg"), ("HBAO 2x2", "falloff")} & listed
 
 
 def test_the_overview_holds_reference_and_best_fits_pixel_by_pixel(compared: Measurement) -> None:

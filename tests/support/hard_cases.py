@@ -27,24 +27,24 @@ TECHNIQUES: dict[str, Make] = {
     "bitmask": ts.HBAO,
     "increments": lambda *a, **k: ts.HBAO(*a, **({"estimator": "increments"} | k)),
     "march": ts.RayMarchedSSAO,
-    "march-thick": lambda *a, **k: ts.RayMarchedSSAO(*a, **({"thickness": 0.4} | k)),
+    "march-solid": lambda *a, **k: ts.RayMarchedSSAO(*a, **({"thickness": None} | k)),
 }
 TITLES = {
     "statvo": "StatVO",
     "bitmask": "HBAO bitmask",
     "increments": "HBAO increments",
     "march": "RayMarchedSSAO",
-    "march-thick": "RayMarchedSSAO, thickness 0.4",
+    "march-solid": "RayMarchedSSAO, infinite thickness",
 }
 TAPS: dict[str, tuple[dict[str, int], dict[str, int]]] = {  # the default, and many more
     "statvo": ({}, {"layers": 16}),
     "bitmask": ({}, {"slices": 16, "steps": 16}),
     "increments": ({}, {"slices": 16, "steps": 16}),
     "march": ({}, {"rays": 64, "steps": 32}),
-    "march-thick": ({}, {"rays": 64, "steps": 32}),
+    "march-solid": ({}, {"rays": 64, "steps": 32}),
 }
 HORIZON = ("bitmask", "increments")
-MARCH = ("march", "march-thick")
+MARCH = ("march", "march-solid")
 CAPPED = HORIZON + MARCH  # those that sample, and have a cap and a denoiser
 
 
@@ -327,7 +327,7 @@ def weighting(name: str) -> float:
             ({"weighting": w, "thickness": None, "falloff": 2.0}, {"weighting": w, "falloff": "quadratic"})
             for w in ("cosine", "uniform")
         ],
-        "march": [({}, {"falloff": "linear"})],
+        "march-solid": [({}, {"falloff": "linear"})],
     }
     scene = analytic.wall()
     gb = scene.render(scene.camera(*scenes.SIZE))

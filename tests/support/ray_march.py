@@ -87,7 +87,10 @@ def some_pixels(
         torch.full((1, height * width), radius, dtype=torch.float64),
         torch.tensor([falloff], dtype=torch.float64),
         None if thickness is None else torch.tensor([thickness], dtype=torch.float64),
-        tangent_planes(points, normals, orthographic=orthographic).flatten(2, 3).transpose(1, 2).contiguous(),
+        tangent_planes(points, normals, gb.valid, intrinsics, orthographic=orthographic)
+        .flatten(2, 3)
+        .transpose(1, 2)
+        .contiguous(),
         gb.valid.flatten(2).transpose(1, 2),
         intrinsics,
     )

@@ -19,6 +19,8 @@ from torch_ssao.ops.denoise import denoise_visibility
 from torch_ssao.ops.falloff import contrast_power
 from torch_ssao.ops.normals import normals_from_points
 
+LEAST_LENGTH = 1e-6  # of a normal: shorter ones are noise
+
 
 @dataclass(frozen=True)
 class ParameterSpec:
@@ -105,8 +107,8 @@ class AmbientVisibility(nn.Module, abc.ABC):
     ) -> Tensor:
         """(B, H, W) visibility before contrast.
 
-        `depth` (B, L, H, W) and `normal` (B, 3, H, W) are finite everywhere and at least float32; what is returned at
-        invalid pixels is ignored.
+        `depth` (B, L, H, W) and `normal` (B, 3, H, W) are finite everywhere and at least float32, normals of length 1; what
+        is returned at invalid pixels is ignored.
         """
 
     def used_parameters(self) -> tuple[str, ...]:
@@ -148,12 +150,12 @@ class AmbientVisibility(nn.Module, abc.ABC):
         """Ambient visibility of a G-buffer.
 
         Args:
-            gbuffer: see `GBuffer`; float16 and bfloat16 depth is computed in float32. Works without the batch dimension
-                under `torch.func.vmap`.
+            gbuffer: see `GBuffer`; float16 and bfloat16 depth is computed in float32. Normals are made unit; zero ones, and
+                those that are not finite, face the eye plane. Works without the batch dimension under `torch.func.vmap`.
             frame: integer offset of the noise pattern, for techniques that have one.
             backend: "auto" or "torch".
         Returns: (B, 1, H, W) visibility in [0, 1]; 1 and gradient 0 at invalid pixels.
-        Gradients: to depth, normal, camera and the module's parameters.
+        Gradients: to depth, normal (through its length too: none along itself), camera and the module's parameters.
         """
         checks.check_choice("backend", backend, ("auto", "torch"))
         if gbuffer.depth.ndim == 3:  # inside vmap
@@ -163,7 +165,7 @@ class AmbientVisibility(nn.Module, abc.ABC):
             valid = gbuffer.valid_mask
             # Invalid samples get a harmless depth before any arithmetic: a NaN times a zero gradient is still NaN.
             depth = _wide(torch.where(valid, gbuffer.depth, 1.0))
-            normal = None if gbuffer.normal is None else _wide(_repaired(gbuffer.normal, valid[:, :1]))
+            normal = None if gbuffer.normal is None else _unit(_wide(gbuffer.normal), valid[:, :1])
             visibility = self._visibility(depth, valid, normal, gbuffer.camera, frame=frame, backend=backend)
             if self.denoise:
                 visibility = self._denoised(visibility, depth, valid, normal, gbuffer.camera)
@@ -200,9 +202,14 @@ def _log(value: float) -> float:
     return math.log(value) if value > 0 else -math.inf  # exp brings 0 back
 
 
-def _repaired(normal: Tensor, seen: Tensor) -> Tensor:
-    """Zero for a normal that is not finite or not seen, with gradient 0: one such pixel must not spoil the others' gradients."""
-    return torch.where(seen & torch.isfinite(normal).all(1, keepdim=True), normal, 0.0)
+def _unit(normal: Tensor, seen: Tensor) -> Tensor:
+    """Normals of length 1: interpolation leaves them shorter. One that is not seen, or that has no length to divide by (zero,
+    not finite, or with a square that is not) faces the eye plane, with gradient 0: it must not spoil the others' gradients."""
+    square = normal.detach().square().sum(1, keepdim=True)
+    usable = seen & torch.isfinite(square) & (square > LEAST_LENGTH**2)
+    facing = normal.new_tensor([0.0, 0.0, -1.0]).view(1, 3, 1, 1)
+    kept = torch.where(usable, normal, facing)
+    return kept / torch.linalg.vector_norm(kept, dim=1, keepdim=True)
 
 
 def _wide(tensor: Tensor) -> Tensor:

@@ -27,7 +27,8 @@ class RayMarchedSSAO(AmbientVisibility):
         contrast: exponent of the visibility, > 0.
         rays: rays a pixel, >= 1.
         steps: steps a ray, >= 1, uniform.
-        thickness: how far solids reach behind their last known surface, of the radius, > 0; None: for ever.
+        thickness: how far solids reach behind their last known surface, of the radius, > 0; None: for ever. The default is the
+            best of benchmarks/results/default_thickness.json at the default falloff; it is the parameter to fit.
         gradient: "exact", "surrogate" or "soft"; see `ops.ray_march`. With "exact" the gradient to
             thickness is 0.
         surrogate_width: width of the sigmoid of "surrogate" and "soft", of the radius, > 0.
@@ -65,7 +66,7 @@ class RayMarchedSSAO(AmbientVisibility):
         contrast: float = 1.0,
         rays: int = 16,
         steps: int = 8,
-        thickness: float | None = None,
+        thickness: float | None = 0.5,
         gradient: str = "exact",
         surrogate_width: float = 0.05,
         max_radius_px: float | None = None,
@@ -98,7 +99,7 @@ class RayMarchedSSAO(AmbientVisibility):
         radius, falloff = (value.to(depth.dtype).expand(batch) for value in (self.radius, self.falloff))
         thickness = None if self.thickness is None else self.thickness.to(depth.dtype).expand(batch)
         intrinsics = torch.stack((camera.fx, camera.fy, camera.cx, camera.cy), 1).to(depth.dtype)
-        nearest = _repaired(normal) if normal is not None else normals_from_points(points[:, :, 0], valid[:, 0])
+        nearest = normals_from_points(points[:, :, 0], valid[:, 0]) if normal is None else normal
         deeper = [normals_from_points(points[:, :, layer], valid[:, layer]) for layer in range(1, layers)]
         return ray_march_visibility(
             points,
@@ -125,11 +126,3 @@ class RayMarchedSSAO(AmbientVisibility):
         focal = torch.maximum(camera.fx, camera.fy).to(depth.dtype)[:, None, None]
         scale = 1.0 if camera.is_orthographic else depth
         return torch.minimum(reach, self.max_radius_px * scale / focal)
-
-
-def _repaired(normal: Tensor) -> Tensor:
-    """Unit normals; where one is not finite or zero, one that faces the eye, without gradient."""
-    length = torch.linalg.vector_norm(torch.nan_to_num(normal.detach(), nan=0.0, posinf=0.0, neginf=0.0), dim=1)
-    usable = (torch.isfinite(normal).all(1) & (length > 1e-6) & torch.isfinite(length))[:, None]
-    facing = normal.new_tensor([0.0, 0.0, -1.0]).view(1, 3, 1, 1)
-    return torch.nn.functional.normalize(torch.where(usable, normal, facing), dim=1)

@@ -3,9 +3,10 @@
 Rays start at the nearest layer; directions are disk points turned by `rotation` and shifted within their rings,
 lifted to the hemisphere and aligned to the normal. Step j = 1 ... `steps` at j R / steps reads the whole pixel it
 falls on; the stored sample stands for its tangent plane there, so that a plane never occludes itself at any angle
-(up to 88.9 degrees, where slopes are capped): the allowance for a pixel's footprint is its slope times the step's
-offset from the pixel's centre, and a step must lie 8 eps (|x| + R) below the plane. The first step inside a solid
-is a hit, at the distance of Eq. 1; a ray counts 1 without a hit, 1 - W_p(distance / R) with one.
+(up to 88.9 degrees, where slopes are capped, or to what the depth map supports, `plane_support`): the allowance for a
+pixel's footprint is its slope times the step's offset from the pixel's centre, and a step must lie 8 eps (|x| + R)
+below the plane. The first step inside a solid is a hit, at the distance of Eq. 1; a ray counts 1 without a hit,
+1 - W_p(distance / R) with one.
 Layers 0, 1, 2, ... are entry, exit, entry, ...: inside is behind an entry and before the next valid exit, and, with
 a thickness, no deeper than that behind the entry.
 Steps off the screen or behind the eye never occlude; a ray counts by the share of its steps that fall in the image
@@ -25,7 +26,8 @@ from torch import Tensor
 
 from torch_ssao import checks
 from torch_ssao.ops import ray_march_hit as hit
-from torch_ssao.ops.ray_march_hit import MIN_FACING, Pixels, Steps
+from torch_ssao.ops.plane_support import least_facing
+from torch_ssao.ops.ray_march_hit import Pixels, Steps
 from torch_ssao.ops.recompute import Outputs, pull_back, push_forward, recompute
 
 GRADIENTS = ("exact", "surrogate", "soft")
@@ -87,28 +89,32 @@ def ray_march_visibility(
         reach.flatten(1),
         falloff,
         thickness,
-        tangent_planes(points, normal, orthographic=orthographic).flatten(2, 3).transpose(1, 2).contiguous(),
+        tangent_planes(points, normal, valid, intrinsics, orthographic=orthographic)
+        .flatten(2, 3)
+        .transpose(1, 2)
+        .contiguous(),
         valid.flatten(2).transpose(1, 2),
         intrinsics.detach(),
     )
     return visibility.unflatten(1, (height, width))
 
 
-def tangent_planes(points: Tensor, normal: Tensor, *, orthographic: bool) -> Tensor:
+def tangent_planes(points: Tensor, normal: Tensor, valid: Tensor, intrinsics: Tensor, *, orthographic: bool) -> Tensor:
     """Planes through samples: unit normal n and n . point, tilted towards the eye where they face it too little.
 
     Args:
-        points, normal: (B, 3, L, H, W).
+        points, normal: (B, 3, L, H, W). valid: (B, L, H, W) bool. intrinsics: (B, 4) fx, fy, cx, cy in pixels.
         orthographic: parallel projection.
-    Returns: (B, L, H, W, 4); the cosine between n and the ray to the eye is at least `MIN_FACING`.
-    Gradients: to both.
+    Returns: (B, L, H, W, 4); the cosine between n and the ray to the eye is at least `plane_support.least_facing`.
+    Gradients: to points, normal and intrinsics.
     """
     if orthographic:
         ray = points.new_tensor([0.0, 0.0, 1.0]).view(1, 3, 1, 1, 1)
     else:
         length = points.square().sum(1, keepdim=True).clamp(min=torch.finfo(points.dtype).tiny).sqrt()
         ray = points / length
-    lacking = ((normal * ray).sum(1, keepdim=True) + MIN_FACING).clamp(min=0)
+    least = least_facing(points, normal, valid, intrinsics, orthographic=orthographic)[:, None]
+    lacking = ((normal * ray).sum(1, keepdim=True) + least).clamp(min=0)
     facing = normal - lacking * ray
     return torch.cat((facing, (facing * points).sum(1, keepdim=True)), 1).movedim(1, -1)
 

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from torch_ssao.ops.falloff import attenuation
 from torch_ssao.ops.partition import ROUNDING
+from torch_ssao.ops.plane_support import MIN_FACING
 
-MIN_FACING = 0.02  # cosine to the view ray at which slopes of stored planes are capped: 88.9 degrees
 _AWAY = 1e-4  # 1 - n_z is kept above this: a normal along +z, away from the eye, has no shortest turn
 
 
