@@ -43,7 +43,7 @@ def build_pyramid(valid: Tensor, cap: float, dtype: torch.dtype) -> Pyramid:
     Gradients: none.
     Cost: a third of the image, a few passes; 8 bytes a texel.
     """
-    batch, height, width = valid.shape
+    _, height, width = valid.shape
     pixel = torch.arange(valid.numel(), device=valid.device).view(valid.shape)
     levels, known, starts = [pixel.flatten()], valid, [0]
     for _ in range(LEVELS - 1):
