@@ -25,7 +25,7 @@ def random_mask(*shape: int, share: float, seed: int = 0) -> torch.Tensor:
 @pytest.mark.parametrize("size", [(37, 70), (64, 64), (1, 9), (33, 1)])
 def test_every_texel_is_the_pixel_of_the_oracle(size: tuple[int, int], share: float) -> None:
     valid = random_mask(2, *size, share=share)
-    pyramid = build_pyramid(valid, 2.5, torch.float64)
+    pyramid = build_pyramid(valid, 2.5)
     generator = torch.Generator().manual_seed(1)
     image, row, column = (torch.randint(n, (400,), generator=generator) for n in (2, *size))
     distance = torch.rand(400, generator=generator, dtype=torch.float64) * 120
@@ -37,7 +37,7 @@ def test_every_texel_is_the_pixel_of_the_oracle(size: tuple[int, int], share: fl
 
 
 def test_reads_stay_within_the_cap_in_texels_and_keep_their_place() -> None:
-    pyramid = build_pyramid(random_mask(1, 200, 300, share=0.7), 8.0, torch.float32)
+    pyramid = build_pyramid(random_mask(1, 200, 300, share=0.7), 8.0)
     column = torch.arange(1, 256)
     at = texels_at(pyramid, torch.tensor(0), torch.tensor(0), column, column.float())
     level = torch.bucketize(at, pyramid.start, right=True) - 1
@@ -49,7 +49,7 @@ def test_reads_stay_within_the_cap_in_texels_and_keep_their_place() -> None:
 
 
 def test_no_row_and_no_column_is_left_out() -> None:
-    pyramid = build_pyramid(torch.ones(1, 64, 96, dtype=torch.bool), 1.0, torch.float32)
+    pyramid = build_pyramid(torch.ones(1, 64, 96, dtype=torch.bool), 1.0)
     first = pyramid.pixel[int(pyramid.start[1]) : int(pyramid.start[2])]
     assert torch.equal(first.div(96, rounding_mode="floor").unique(), torch.arange(64))
     assert torch.equal((first % 96).unique(), torch.arange(96))

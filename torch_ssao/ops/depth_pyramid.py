@@ -23,7 +23,7 @@ class Pyramid(NamedTuple):
 
     pixel: Tensor  # (M,) flat pixels of the batch, level after level; the first are the pixels themselves
     start: Tensor  # (LEVELS,) first texel of each level
-    bounds: Tensor  # (LEVELS - 1,) distances, pixels, beyond which the next level is read
+    cap: float  # furthest read, in texels of its level
     height: int
     width: int
 
@@ -33,13 +33,12 @@ def furthest_read(cap: float | None) -> float | None:
     return None if cap is None else cap * 2 ** (LEVELS - 1)
 
 
-def build_pyramid(valid: Tensor, cap: float, dtype: torch.dtype) -> Pyramid:
+def build_pyramid(valid: Tensor, cap: float) -> Pyramid:
     """Select the pixels of all levels.
 
     Args:
         valid: (B, H, W) bool.
         cap: furthest read, in texels of its level, > 0.
-        dtype: of the distances that are going to be asked for.
     Gradients: none.
     Cost: a third of the image, a few passes; 8 bytes a texel.
     """
@@ -50,8 +49,7 @@ def build_pyramid(valid: Tensor, cap: float, dtype: torch.dtype) -> Pyramid:
         starts.append(starts[-1] + levels[-1].numel())
         pixel, known = _coarser(pixel, known)
         levels.append(pixel.flatten())
-    bounds = cap * 2.0 ** torch.arange(LEVELS - 1, dtype=dtype, device=valid.device)
-    return Pyramid(torch.cat(levels), torch.tensor(starts, device=valid.device), bounds, height, width)
+    return Pyramid(torch.cat(levels), torch.tensor(starts, device=valid.device), cap, height, width)
 
 
 def texels_at(pyramid: Pyramid, image: Tensor, row: Tensor, column: Tensor, distance: Tensor) -> Tensor:
@@ -62,7 +60,9 @@ def texels_at(pyramid: Pyramid, image: Tensor, row: Tensor, column: Tensor, dist
         distance: pixels from where the question is asked.
     Returns: int64 places in `Pyramid.pixel`.
     """
-    level = torch.bucketize(distance.contiguous(), pyramid.bounds)
+    level = torch.zeros_like(distance, dtype=torch.int64)
+    for finer in range(LEVELS - 1):  # on a CPU faster than a search, and than a logarithm right on the bounds
+        level += distance > pyramid.cap * 2**finer
     rows = ((pyramid.height - 1) >> level) + 1  # rounded up
     columns = ((pyramid.width - 1) >> level) + 1
     return pyramid.start[level] + (image * rows + (row >> level)) * columns + (column >> level)

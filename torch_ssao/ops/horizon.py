@@ -129,7 +129,7 @@ class _Inputs(NamedTuple):
         flat = [None if t is None else t.transpose(0, 1).flatten(1) for t in (planes, normal)]
         # Levels are copies: what is read lies together.
         stored = flat[0] if pyramid is None else flat[0][:, pyramid.pixel]  # type: ignore[index]
-        return _Inputs(flat[0], valid, flat[1], *rest, stored, pyramid)  # type: ignore[arg-type]
+        return _Inputs(flat[0], valid, flat[1], *rest, stored, pyramid)  # type: ignore[arg-type, call-arg]
 
     @property
     def scalars(self) -> tuple[Tensor | None, ...]:
@@ -195,9 +195,8 @@ class _Horizon(NamedTuple):
         return _images(total, inputs)
 
     def _pyramid(self, tensors: Sequence[Tensor | None]) -> Pyramid | None:
-        depth, valid = tensors[:2]
-        cap = self.layout.max_radius_px
-        return None if cap is None or depth is None or valid is None else build_pyramid(valid, cap, depth.dtype)
+        valid, cap = tensors[1], self.layout.max_radius_px
+        return None if cap is None or valid is None else build_pyramid(valid, cap)
 
     def _nothing(self, inputs: _Inputs) -> Tensor:
         return inputs.planes.new_zeros(1, inputs.planes.shape[1])

@@ -152,7 +152,7 @@ def _inputs(tensors: Sequence[Tensor | None], spec: _Spec) -> _Inputs:
     if spec.max_radius_px is None:
         return inputs
     known = inputs.valid.any(2).unflatten(1, (spec.height, spec.width))
-    return inputs._replace(pyramid=build_pyramid(known, spec.max_radius_px, inputs.reach.dtype))
+    return inputs._replace(pyramid=build_pyramid(known, spec.max_radius_px))
 
 
 def _stored(planes: Tensor, pyramid: Pyramid | None) -> Tensor:
