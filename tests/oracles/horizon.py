@@ -16,6 +16,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from oracles.depth_pyramid import LEVELS, fade, level_at, selected_pixel
+
 Floats = npt.NDArray[np.float64]
 
 GOLDEN: Final = (math.sqrt(5.0) - 1.0) / 2.0  # turns by which successive half-slices shift the taps
@@ -229,7 +231,8 @@ def pixel_obscurance(
     view = direction / np.linalg.norm(direction)
     radius = s.radius
     if s.max_radius_px is not None:
-        radius = min(radius, s.max_radius_px / max(s.fx, s.fy) * (1.0 if s.orthographic else point[2]))
+        furthest = s.max_radius_px * 2 ** (LEVELS - 1)
+        radius = min(radius, furthest / max(s.fx, s.fy) * (1.0 if s.orthographic else point[2]))
     wide = radius
     if not s.orthographic:
         wide /= math.sqrt(1 - min(radius / float(np.linalg.norm(point)), WIDEST) ** 2)
@@ -285,6 +288,8 @@ def make_tap(
     nothing = Tap(point, view, reach, 0.0, reach, False)
     if not (0 <= column < depth.shape[1] and 0 <= row < depth.shape[0]) or not SMALL < 1 / left < 1 / SMALL:
         return nothing
+    if s.max_radius_px is not None:
+        row, column = selected_pixel(valid, row, column, level_at(pixels, s.max_radius_px))
     if not valid[row, column]:
         return nothing
     base = level_of(depth[row, column], s)
@@ -328,5 +333,6 @@ def horizon_obscurance(
             amount = pixel_obscurance(
                 z[image], seen[image], n[image, :, row, column], row, column, turn[row, column], shift[row, column], s
             )
+            amount *= fade(s.radius * max(s.fx, s.fy) / (1.0 if s.orthographic else z[place]))
             result[place] = min(max(amount, 0.0), 1.0)
     return result

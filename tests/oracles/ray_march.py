@@ -16,6 +16,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from oracles.depth_pyramid import fade, level_at, selected_pixel
+
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
@@ -38,6 +40,7 @@ class Image:
     falloff: float
     thickness: float | None
     eps: float
+    max_radius_px: float | None
     flattest: dict[tuple[int, int, int], float] = field(default_factory=dict)  # of planes asked for already
 
 
@@ -59,8 +62,8 @@ def hemisphere_direction(point: Floats, turn: float, outwards: float, normal: Fl
     return lifted * cosine + np.cross(axis, lifted) * sine + axis * (axis @ lifted) * (1.0 - cosine)
 
 
-def pixel_of(image: Image, place: Floats) -> tuple[int, int] | None:
-    """Row and column a position falls on; None outside of the image or behind the eye."""
+def pixel_of(image: Image, place: Floats, start: Floats) -> tuple[int, int] | None:
+    """Row and column of the sample read at a position, by a ray from `start`; None outside of the image or behind the eye."""
     if place[2] <= 0.0:
         return None
     fx, fy, cx, cy = image.camera
@@ -69,7 +72,12 @@ def pixel_of(image: Image, place: Floats) -> tuple[int, int] | None:
     height, width = image.valid.shape[1:]
     if not (0.0 <= column < width and 0.0 <= row < height):
         return None
-    return math.floor(row), math.floor(column)
+    if image.max_radius_px is None:
+        return math.floor(row), math.floor(column)
+    scale = 1.0 if image.orthographic else start[2]
+    away = max(abs(fx * start[0] / scale + cx - column), abs(fy * start[1] / scale + cy - row))
+    level = level_at(away, image.max_radius_px)
+    return selected_pixel(image.valid.any(0), math.floor(row), math.floor(column), level)
 
 
 def shown_slope(image: Image, layer: int, pixel: tuple[int, int], axis: int) -> float | None:
@@ -140,7 +148,7 @@ def ray_visibility(image: Image, start: Floats, direction: Floats, reach: float)
     slack = ROUNDING_EPSILONS * image.eps * (float(np.linalg.norm(start)) + reach)
     thickness = math.inf if image.thickness is None else image.thickness * reach
     places = [start + (j / image.steps) * reach * direction for j in range(image.steps + 1)]
-    pixels = [pixel_of(image, place) for place in places]
+    pixels = [pixel_of(image, place, start) for place in places]
     share = sum(pixel is not None for pixel in pixels[1:]) / image.steps
     before: float | None = 0.0  # the ray starts on the surface
     for j in range(1, image.steps + 1):
@@ -177,6 +185,7 @@ def ray_march_visibility(
     contrast: float,
     thickness: float | None,
     eps: float,
+    max_radius_px: float | None = None,
 ) -> Floats:
     """Visibility (B, H, W) of a batch.
 
@@ -194,7 +203,7 @@ def ray_march_visibility(
     answer = np.ones(lengths.shape)
     for b in range(len(x)):
         camera = tuple(float(value) for value in np.asarray(intrinsics, np.float64)[b])
-        image = Image(x[b], n[b], usable[b], camera, orthographic, steps, falloff, thickness, eps)  # type: ignore[arg-type]
+        image = Image(x[b], n[b], usable[b], camera, orthographic, steps, falloff, thickness, eps, max_radius_px)  # type: ignore[arg-type]
         for row, column in np.argwhere(usable[b, 0]):
             start, normal = x[b, 0, row, column], n[b, 0, row, column]
             rays = [
@@ -205,5 +214,6 @@ def ray_march_visibility(
             ]
             weight = sum(share for _, share in rays)
             mean = sum(value * share for value, share in rays) / weight if weight > 0.0 else 1.0
-            answer[b, row, column] = mean**contrast
+            span = lengths[b, row, column] * max(camera[:2]) / (1.0 if orthographic else start[2])
+            answer[b, row, column] = (1.0 - fade(span) * (1.0 - mean)) ** contrast
     return answer

@@ -255,16 +255,12 @@ def cost(name: str) -> float:
 
 
 def reach(name: str) -> float:
-    """How far, in caps of 8 pixels, a pixel looks with a very large radius."""
-    gb = scenes.steps()
-    depth = gb.depth.clone().requires_grad_()
-    image = make(name, 400.0, max_radius_px=8.0)(replace(gb, depth=depth))[0, 0]
-    furthest = 0
-    for row, column in ((24, 32), (10, 20), (12, 34), (36, 24), (20, 52)):
-        (grad,) = torch.autograd.grad(image[row, column], depth, retain_graph=True)
-        away = torch.nonzero(grad[0, 0]) - torch.tensor([row, column])
-        furthest = max([furthest, *away.abs().flatten().tolist()])
-    return furthest / 8
+    """The largest mean change that caps of 8, 16 and 32 pixels make where the radius spans 60 to 160 pixels."""
+    gb = scenes.temple(144, 192)
+    image = make(name, 8.0)(gb)
+    seen = gb.valid_mask[:, :1]
+    changes = [float((make(name, 8.0, max_radius_px=cap)(gb) - image)[seen].mean()) for cap in (8.0, 16.0, 32.0)]
+    return max(changes, key=abs)
 
 
 def relative_parameters(name: str) -> float:

@@ -43,7 +43,7 @@ def oracle(net: ts.RayMarchedSSAO, gb: ts.GBuffer, *, frame: int = 0, eps: float
     if net.max_radius_px is not None:
         focal = intrinsics[:, :2].amax(1)[:, None, None]
         scale = 1.0 if gb.camera.is_orthographic else points[:, 2, 0]
-        reach = torch.minimum(reach, net.max_radius_px * scale / focal)
+        reach = torch.minimum(reach, 32 * net.max_radius_px * scale / focal)
     rotation, offset = tiled_noise(height, width, frame, dtype=torch.float64, device=gb.depth.device)
     image = oracle_visibility(
         points,
@@ -60,6 +60,7 @@ def oracle(net: ts.RayMarchedSSAO, gb: ts.GBuffer, *, frame: int = 0, eps: float
         contrast=values["contrast"],
         thickness=values.get("thickness"),
         eps=eps,
+        max_radius_px=net.max_radius_px,
     )
     return torch.from_numpy(image)[:, None]
 
@@ -96,7 +97,7 @@ def some_pixels(
     )
     total = weight = torch.zeros(1, dtype=torch.float64)
     for ray in range(0, rays, 128):
-        piece = _Piece(kernel, _Block(slice(ray, ray + 128), slice(0, 1), pixels), inputs)
+        piece = _Piece(kernel, _Block(slice(ray, ray + 128), slice(0, 1), pixels), inputs, inputs.planes)
         total = total + piece.visibility(*piece.leaves)[0][0]
         weight = weight + piece.weight.sum(0)[0]
     return total / weight, weight > rays * (1 - 1e-9)

@@ -36,8 +36,10 @@ class HBAO(AmbientVisibility):
         bias_deg: elevation over the tangent plane below which nothing occludes, degrees, >= 0.
         step_power: taps lie at R ((k + jitter) / steps)^step_power.
         connected: estimator "bitmask" also covers the arcs between neighbouring taps of one surface.
-        max_radius_px: pixels; where the radius spans more, it is shortened to this, so close surfaces are occluded by their
-            surroundings only. None: no limit.
+        max_radius_px: taps further than this many pixels from their pixel read a coarser level of a pyramid of selected
+            pixels (`ops.depth_pyramid`), so that reads stay near each other; what lies between the selected pixels may be
+            missed. Where the radius spans more than 32 times as many, it is shortened: less far-reaching occlusion there.
+            None: every tap reads its own pixel.
         offscreen: "open" - what is off the image never occludes; "extend" - the surfaces at the border go on as planes.
         denoise: passes of the edge-aware filter.
         learnable: names of the parameters to register as `nn.Parameter`s, or "all"; the rest are buffers.

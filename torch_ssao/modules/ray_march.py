@@ -10,6 +10,7 @@ from torch import Tensor
 from torch_ssao import checks
 from torch_ssao.camera import Camera
 from torch_ssao.modules.base import AmbientVisibility, ParameterSpec, Positive
+from torch_ssao.ops.depth_pyramid import furthest_read
 from torch_ssao.ops.normals import normals_from_points
 from torch_ssao.ops.ray_march import GRADIENTS, ray_march_visibility
 from torch_ssao.ops.sampling import poisson_disk, tiled_noise
@@ -32,8 +33,10 @@ class RayMarchedSSAO(AmbientVisibility):
         gradient: "exact", "surrogate" or "soft"; see `ops.ray_march`. With "exact" the gradient to
             thickness is 0.
         surrogate_width: width of the sigmoid of "surrogate" and "soft", of the radius, > 0.
-        max_radius_px: longest ray on the screen, in pixels; nearer pixels, where the radius spans more, get the radius
-            that spans as much: less far-reaching occlusion there. None: no limit.
+        max_radius_px: steps further than this many pixels from their pixel read a coarser level of a pyramid of selected
+            pixels (`ops.depth_pyramid`), so that reads stay near each other; what lies between the selected pixels may be
+            missed. Where the radius spans more than 32 times as many, it is shortened: less far-reaching occlusion there.
+            None: every step reads its own pixel.
         denoise: passes of `ops.denoise.denoise_visibility`, before the contrast.
         learnable: names of the parameters to register as `nn.Parameter`s, or "all"; the rest are buffers.
     Raises:
@@ -116,13 +119,15 @@ class RayMarchedSSAO(AmbientVisibility):
             orthographic=camera.is_orthographic,
             gradient=self.gradient,
             surrogate_width=self.surrogate_width,
+            max_radius_px=self.max_radius_px,
         )
 
     def _reach(self, radius: Tensor, depth: Tensor, camera: Camera) -> Tensor:
         """(B, H, W) length of each pixel's rays."""
         reach = radius[:, None, None].expand(depth.shape)
-        if self.max_radius_px is None:
+        longest = furthest_read(self.max_radius_px)
+        if longest is None:
             return reach
         focal = torch.maximum(camera.fx, camera.fy).to(depth.dtype)[:, None, None]
         scale = 1.0 if camera.is_orthographic else depth
-        return torch.minimum(reach, self.max_radius_px * scale / focal)
+        return torch.minimum(reach, longest * scale / focal)

@@ -26,6 +26,8 @@ from torch import Tensor
 from torch_ssao import checks
 from torch_ssao.ops import horizon_arcs as arcs
 from torch_ssao.ops import horizon_taps as taps
+from torch_ssao.ops.depth_pyramid import Pyramid, build_pyramid
+from torch_ssao.ops.footprint import footprint_fade
 from torch_ssao.ops.recompute import Outputs, pull_back, push_forward, recompute
 
 BLOCK = {"cpu": 2**18, "cuda": 2**21}  # taps worked on at a time: what fits a cache, what fills a GPU
@@ -75,10 +77,13 @@ def horizon_obscurance(
         weighting: "cosine" or "uniform".
         estimator: "increments" or "bitmask".
         connected: "bitmask" also covers the arcs between neighbouring taps of one surface.
-        max_radius_px: shortens R where it spans more pixels; None never.
+        max_radius_px: taps further than this many pixels away read a coarser level of a pyramid of selected pixels
+            (`ops.depth_pyramid`), whose plane stands for more of the image: reads stay near each other, and what lies between
+            the selected pixels may be missed. R is shortened where it spans more than 32 times as much. None: every tap
+            reads its own pixel.
         offscreen: taps off the image never occlude ("open"), or meet the plane of the nearest pixel ("extend").
         footprint_step: of the footprint, over which its effect is differenced in derivatives.
-    Returns: (B, H, W) obscurance in [0, 1].
+    Returns: (B, H, W) obscurance in [0, 1]; it fades out where R spans less than a pixel (`ops.footprint`).
     Gradients: to depth, normal, intrinsics, radius, falloff, thickness and bias, of the expected estimate (above);
         footprint_step = 0 gives the derivative almost everywhere. Of a change of the footprint by fx and fy each takes half.
         Forward mode alike. Second derivatives raise a RuntimeError.
@@ -94,8 +99,9 @@ def horizon_obscurance(
     planes = taps.surface_planes(depth, valid, intrinsics[:, :2], orthographic=orthographic)
     layout = taps.Layout(slices, steps, step_power, orthographic, max_radius_px, offscreen == "extend")
     kernel = _Horizon(layout, weighting == "cosine", estimator, connected, rotation, offset, footprint_step)
-    obscurance = recompute(kernel, planes, valid, normal, intrinsics, radius, falloff, thickness, bias)
-    return torch.where(valid, obscurance, 0.0).clamp(0, 1)
+    obscurance = recompute(kernel, planes, valid, normal, intrinsics, radius, falloff, thickness, bias)[:, 0]
+    fade = footprint_fade(depth, valid, radius[:, None, None], intrinsics[:, :2], orthographic=orthographic)
+    return torch.where(valid, obscurance * fade, 0.0).clamp(0, 1)
 
 
 def _usable(normal: Tensor, valid: Tensor) -> Tensor:
@@ -114,12 +120,21 @@ class _Inputs(NamedTuple):
     falloff: Tensor
     thickness: Tensor | None
     bias: Tensor
+    stored: Tensor  # (3, M) planes that taps read: of the pixels, or of the texels of the pyramid, in their order
+    pyramid: Pyramid | None
 
     @staticmethod
-    def of(tensors: Sequence[Tensor | None]) -> _Inputs:
+    def of(tensors: Sequence[Tensor | None], pyramid: Pyramid | None) -> _Inputs:
         planes, valid, normal, *rest = tensors
         flat = [None if t is None else t.transpose(0, 1).flatten(1) for t in (planes, normal)]
-        return _Inputs(flat[0], valid, flat[1], *rest)  # type: ignore[arg-type]
+        # Levels are copies: what is read lies together.
+        stored = flat[0] if pyramid is None else flat[0][:, pyramid.pixel]  # type: ignore[index]
+        return _Inputs(flat[0], valid, flat[1], *rest, stored, pyramid)  # type: ignore[arg-type, call-arg]
+
+    @property
+    def scalars(self) -> tuple[Tensor | None, ...]:
+        """Those of an image: intrinsics, radius, falloff, thickness, bias."""
+        return self[3:8]  # type: ignore[return-value]
 
 
 class _Horizon(NamedTuple):
@@ -133,49 +148,58 @@ class _Horizon(NamedTuple):
     name: str = "horizon_obscurance"
 
     def value(self, *tensors: Tensor | None) -> Outputs:
-        inputs = _Inputs.of(tensors)
-        total = torch.zeros_like(inputs.planes[0])
+        inputs = _Inputs.of(tensors, self._pyramid(tensors))
+        total = self._nothing(inputs)
         for block in self._blocks(inputs):
-            total[block.start : block.stop] += block.function(*block.leaves)[0]
-        return (total.view(inputs.valid.shape),)
+            total[:, block.piece] += block.function(*block.leaves)[0]
+        return (_images(total, inputs),)
 
     def pull_back(
         self, grad: Tensor, needed: Sequence[bool], outputs: Outputs, *tensors: Tensor | None
     ) -> list[Tensor]:
-        inputs = _Inputs.of(tensors)
+        inputs = _Inputs.of(tensors, self._pyramid(tensors))
         to_planes, to_normal = torch.zeros_like(inputs.planes), torch.zeros_like(inputs.normal)
-        to_rest = [torch.zeros_like(t) for t in inputs[3:] if t is not None]
-        cotangent = grad.reshape(-1)
+        to_stored = to_planes if inputs.pyramid is None else torch.zeros_like(inputs.stored)
+        to_rest = [torch.zeros_like(t) for t in inputs.scalars if t is not None]
+        cotangent = grad.transpose(0, 1).flatten(1)
         for block in self._blocks(inputs):
-            piece = slice(block.start, block.stop)
-            level, normal, read, *rest = pull_back(block.function, block.leaves, (cotangent[piece],))
+            piece = block.piece
+            level, normal, read, *rest = pull_back(block.function, block.leaves, (cotangent[:, piece],))
             if self.footprint_step > 0:
-                own = block.pull_back_spread(cotangent[piece] * block.by_spread(inputs))
+                own = block.pull_back_spread((cotangent[:, piece] * block.by_spread(inputs)).sum(0))
                 level = level + own[0]
                 rest[0], rest[1] = rest[0] + own[1], rest[1] + own[2]
             to_planes[0, piece] += level
             to_normal[:, piece] += normal
-            for image, part in zip(to_planes, read, strict=True):
+            for image, part in zip(to_stored, read, strict=True):
                 image.index_add_(0, block.texels.source.flatten(), part.flatten())
             for total, part in zip(to_rest, rest, strict=True):
                 total += part
-        images = [t.unflatten(1, inputs.valid.shape).transpose(0, 1) for t in (to_planes, to_normal)]
-        everything = iter([images[0], None, images[1], *to_rest])
-        found = [next(everything) if t is not None else None for t in inputs]
+        if inputs.pyramid is not None:
+            to_planes.index_add_(1, inputs.pyramid.pixel, to_stored)
+        everything = iter([_images(to_planes, inputs), None, _images(to_normal, inputs), *to_rest])
+        found = [next(everything) if t is not None else None for t in inputs[:8]]
         return [t for t, want in zip(found, needed, strict=True) if want and t is not None]
 
     def push_forward(self, tangents: Sequence[Tensor | None], outputs: Outputs, *tensors: Tensor | None) -> Tensor:
-        inputs = _Inputs.of(tensors)
+        inputs = _Inputs.of(tensors, self._pyramid(tensors))
         pairs = zip(tensors, tangents, strict=True)
-        moved = _Inputs.of([torch.zeros_like(t) if m is None and t is not None else m for t, m in pairs])
-        total = torch.zeros_like(inputs.planes[0])
+        tangents = [torch.zeros_like(t) if m is None and t is not None else m for t, m in pairs]
+        moved = _Inputs.of(tangents, inputs.pyramid)
+        total = self._nothing(inputs)
         for block in self._blocks(inputs):
-            piece = slice(block.start, block.stop)
             leaves = block.leaves_of(moved)
-            total[piece] += push_forward(block.function, block.leaves, leaves)[0]
+            total[:, block.piece] += push_forward(block.function, block.leaves, leaves)[0]
             if self.footprint_step > 0:
-                total[piece] += block.by_spread(inputs) * block.push_spread(leaves)
-        return total.view(inputs.valid.shape)
+                total[:, block.piece] += block.by_spread(inputs) * block.push_spread(leaves)
+        return _images(total, inputs)
+
+    def _pyramid(self, tensors: Sequence[Tensor | None]) -> Pyramid | None:
+        valid, cap = tensors[1], self.layout.max_radius_px
+        return None if cap is None or valid is None else build_pyramid(valid, cap)
+
+    def _nothing(self, inputs: _Inputs) -> Tensor:
+        return inputs.planes.new_zeros(1, inputs.planes.shape[1])
 
     def _blocks(self, inputs: _Inputs) -> Iterator[_Block]:
         pixels = inputs.planes.shape[1]
@@ -195,25 +219,27 @@ class _Block:
     def __init__(
         self, kernel: _Horizon, inputs: _Inputs, start: int, stop: int, slices: range, spread: float = 1.0
     ) -> None:
-        self.kernel, self.start, self.stop, self.slices = kernel, start, stop, slices
+        self.kernel, self.slices = kernel, slices
         size = (inputs.valid.shape[1], inputs.valid.shape[2])
+        self.piece = slice(start, stop)
         self.pixels = taps.make_pixels(start, stop, slices, kernel.layout, size, kernel.rotation, kernel.offset)
         level, normal = self._own(inputs)
         frame = taps.make_frame(level, normal, inputs.intrinsics, inputs.radius, self.pixels, kernel.layout)
-        self.texels = taps.find_texels(frame, self.pixels, inputs.valid, spread, extend=kernel.layout.extend)
+        self.texels = taps.find_texels(
+            frame, self.pixels, inputs.valid, spread, extend=kernel.layout.extend, pyramid=inputs.pyramid
+        )
         self.leaves = self.leaves_of(inputs)
         self.has_thickness = inputs.thickness is not None
 
     def _own(self, inputs: _Inputs) -> tuple[Tensor, Tensor]:
-        piece = slice(self.start, self.stop)
-        return inputs.planes[0, piece], inputs.normal[:, piece]
+        return inputs.planes[0, self.piece], inputs.normal[:, self.piece]
 
     def leaves_of(self, inputs: _Inputs) -> list[Tensor]:
-        read = torch.stack([plane[self.texels.source] for plane in inputs.planes])
-        return [*self._own(inputs), read, *(t for t in inputs[3:] if t is not None)]
+        read = torch.stack([plane[self.texels.source] for plane in inputs.stored])
+        return [*self._own(inputs), read, *(t for t in inputs.scalars if t is not None)]
 
     def function(self, level: Tensor, normal: Tensor, read: Tensor, *rest: Tensor) -> Outputs:
-        """Obscurance (P,) that this block adds."""
+        """Obscurance (1, P) that this block adds."""
         kernel, image = self.kernel, self.pixels.image
         intrinsics, radius, falloff = rest[:3]
         thickness = rest[3][image] if self.has_thickness else None
@@ -225,16 +251,17 @@ class _Block:
             amount = arcs.weighted_increments(measure, frame, found, falloff[image], thickness, bias)
         else:
             amount = arcs.covered_intervals(measure, frame, found, thickness, bias, connected=kernel.connected)
-        return (amount / kernel.layout.slices,)
+        return (amount[None] / kernel.layout.slices,)
 
     def by_spread(self, inputs: _Inputs) -> Tensor:
-        """Derivative (P,) to the logarithm of the taps' spread: a difference, since taps move by whole pixels."""
+        """Derivative (1, P) to the logarithm of the taps' spread: a difference, since taps move by whole pixels."""
         step = self.kernel.footprint_step
         further, nearer = (
-            _Block(self.kernel, inputs, self.start, self.stop, self.slices, 1 + sign * step) for sign in (1, -1)
+            _Block(self.kernel, inputs, self.piece.start, self.piece.stop, self.slices, 1 + sign * step)
+            for sign in (1, -1)
         )
         change = further.function(*further.leaves)[0] - nearer.function(*nearer.leaves)[0]
-        cap = self.kernel.layout.max_radius_px
+        cap = self.kernel.layout.longest_px
         if cap is not None:  # where it holds, the spread depends on nothing
             level, intrinsics, radius = (self.leaves[i] for i in (0, 3, 4))
             span = radius[self.pixels.image] * intrinsics[self.pixels.image, :2].amax(1)
@@ -256,3 +283,8 @@ class _Block:
         moved = tangents[4] / radius + 0.5 * (tangents[3] / intrinsics)[:, :2].sum(1)
         own = 0.0 if self.kernel.layout.orthographic else tangents[0] / level
         return moved[self.pixels.image] + own
+
+
+def _images(flat: Tensor, inputs: _Inputs) -> Tensor:
+    """(B, C, H, W) of (C, B H W)."""
+    return flat.unflatten(1, inputs.valid.shape).transpose(0, 1)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ssao.ops.depth_pyramid import Pyramid, furthest_read, texels_at
 from torch_ssao.ops.sampling import GOLDEN
 
 SLOPE_LIMIT = 64.0  # a depth step of more pixel footprints than this a pixel is an edge, not a slope (89.1 degrees)
@@ -27,8 +28,13 @@ class Layout(NamedTuple):
     steps: int
     step_power: float
     orthographic: bool
-    max_radius_px: float | None
+    max_radius_px: float | None  # taps further away read a coarser level of the depth pyramid
     extend: bool  # taps off the image read the nearest pixel's plane
+
+    @property
+    def longest_px(self) -> float | None:
+        """Pixels to which the radius is shortened; None: never."""
+        return furthest_read(self.max_radius_px)
 
 
 class Pixels(NamedTuple):
@@ -133,9 +139,9 @@ def make_frame(
     fx, fy, cx, cy = intrinsics[pixels.image].unbind(1)
     radius = radius[pixels.image]
     depth = level if layout.orthographic else 1 / level
-    if layout.max_radius_px is not None:
+    if layout.longest_px is not None:
         unit = torch.maximum(fx, fy)
-        radius = torch.minimum(radius, layout.max_radius_px / unit * (1.0 if layout.orthographic else depth))
+        radius = torch.minimum(radius, layout.longest_px / unit * (1.0 if layout.orthographic else depth))
     cosine, sine = pixels.angle.cos(), pixels.angle.sin()
     if layout.orthographic:
         turned = cosine * normal[0] + sine * normal[1]
@@ -169,16 +175,19 @@ class Texels(NamedTuple):
     pixels: Tensor  # away along the slice's major image axis, >= 1
     column: Tensor
     row: Tensor
-    source: Tensor  # index into the flattened batch
+    source: Tensor  # index into the flattened batch, or into the texels of the pyramid
     seen: Tensor  # bool: exists and is valid
 
 
-def find_texels(frame: Frame, pixels: Pixels, valid: Tensor, spread: float, *, extend: bool) -> Texels:
+def find_texels(
+    frame: Frame, pixels: Pixels, valid: Tensor, spread: float, *, extend: bool, pyramid: Pyramid | None = None
+) -> Texels:
     """Round the taps to whole pixels along the major axis.
 
     Args:
         valid: (B, H, W) bool.
         spread: factor on the taps' distances. extend: see `Layout`.
+        pyramid: of which a tap takes the level of its distance; it meets the plane of the pixel that is found there.
     """
     _, height, width = valid.shape
     longest = frame.radius
@@ -201,8 +210,12 @@ def find_texels(frame: Frame, pixels: Pixels, valid: Tensor, spread: float, *, e
     if away is not None:
         seen = seen & (away > NEAREST) & (away < 1 / NEAREST)
     column, row = (torch.where(seen, texel, 0).long() for texel in (column, row))
-    source = (pixels.image * height + row) * width + column
-    return Texels(count, column, row, source, seen & valid.reshape(-1)[source])
+    if pyramid is None:
+        source = (pixels.image * height + row) * width + column
+        return Texels(count, column, row, source, seen & valid.reshape(-1)[source])
+    source = texels_at(pyramid, pixels.image, row, column, count)
+    pixel = pyramid.pixel[source]
+    return Texels(count, pixel % width, pixel // width % height, source, seen & valid.reshape(-1)[pixel])
 
 
 def meet_surface(frame: Frame, pixels: Pixels, texels: Texels, planes: Tensor) -> Taps:

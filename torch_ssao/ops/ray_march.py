@@ -26,6 +26,8 @@ from torch import Tensor
 
 from torch_ssao import checks
 from torch_ssao.ops import ray_march_hit as hit
+from torch_ssao.ops.depth_pyramid import Pyramid, build_pyramid, texels_at
+from torch_ssao.ops.footprint import footprint_fade
 from torch_ssao.ops.plane_support import least_facing
 from torch_ssao.ops.ray_march_hit import Pixels, Steps
 from torch_ssao.ops.recompute import Outputs, pull_back, push_forward, recompute
@@ -50,6 +52,7 @@ def ray_march_visibility(
     orthographic: bool,
     gradient: str = "exact",
     surrogate_width: float = 0.05,
+    max_radius_px: float | None = None,
 ) -> Tensor:
     """Visibility of every pixel from rays marched through the depth layers.
 
@@ -70,9 +73,12 @@ def ray_march_visibility(
         orthographic: parallel projection along +z.
         gradient: "exact", "surrogate" or "soft", see the module.
         surrogate_width: width of the sigmoid, of the reach, > 0.
-    Returns: (B, H, W) in [0, 1]; 1 at invalid pixels.
-    Gradients: to points, normal, reach, falloff and (not "exact") thickness; to the camera through points. Forward
-        mode alike. Second derivatives raise a RuntimeError.
+        max_radius_px: steps further than this many pixels away read a coarser level of a pyramid of selected pixels
+            (`ops.depth_pyramid`). The reach stays what it is: who calls shortens it to `furthest_read`. None: every step
+            reads its own pixel.
+    Returns: (B, H, W) in [0, 1]; 1 at invalid pixels, and it fades to 1 where the reach spans less than a pixel.
+    Gradients: to points, normal, reach, falloff and (not "exact") thickness; to the camera through points, and to
+        intrinsics through the fading alone. Forward mode alike. Second derivatives raise a RuntimeError.
     Cost: K steps reads of L samples; saved: the inputs and two floats a pixel, whatever the rays and steps.
     Raises: RangeError, ChoiceError.
     Source: Poisson-based ray-marched SSAO, Algorithm 1, Eqs. 1 and 2.
@@ -81,7 +87,7 @@ def ray_march_visibility(
     checks.check_choice("gradient", gradient, GRADIENTS)
     checks.check_positive("surrogate_width", surrogate_width)
     height, width = valid.shape[2:]
-    spec = _Spec(steps, height, width, orthographic, gradient, surrogate_width)
+    spec = _Spec(steps, height, width, orthographic, gradient, surrogate_width, max_radius_px)
     visibility = recompute(
         _March(spec, disk, rotation.reshape(-1), offset.reshape(-1)),
         points[:, :, 0].flatten(2),
@@ -96,7 +102,10 @@ def ray_march_visibility(
         valid.flatten(2).transpose(1, 2),
         intrinsics.detach(),
     )
-    return visibility.unflatten(1, (height, width))
+    visibility = visibility.unflatten(1, (height, width))
+    depth, focal = points[:, 2, 0], intrinsics[:, :2]
+    fade = footprint_fade(depth, valid[:, 0], reach, focal, orthographic=orthographic)
+    return visibility + (1 - fade) * (1 - visibility)
 
 
 def tangent_planes(points: Tensor, normal: Tensor, valid: Tensor, intrinsics: Tensor, *, orthographic: bool) -> Tensor:
@@ -126,6 +135,7 @@ class _Spec(NamedTuple):
     orthographic: bool
     gradient: str
     surrogate_width: float
+    max_radius_px: float | None = None
 
 
 class _Inputs(NamedTuple):
@@ -139,11 +149,21 @@ class _Inputs(NamedTuple):
     planes: Tensor  # (B, N, L, 4)
     valid: Tensor  # (B, N, L)
     intrinsics: Tensor  # (B, 4)
+    pyramid: Pyramid | None = None
 
 
-def _inputs(tensors: Sequence[Tensor | None]) -> _Inputs:
+def _inputs(tensors: Sequence[Tensor | None], spec: _Spec) -> _Inputs:
     inputs = _Inputs(*tensors)  # type: ignore[arg-type]
-    return inputs._replace(planes=inputs.planes.contiguous())  # what is read at random lies together
+    inputs = inputs._replace(planes=inputs.planes.contiguous())  # what is read at random lies together
+    if spec.max_radius_px is None:
+        return inputs
+    known = inputs.valid.any(2).unflatten(1, (spec.height, spec.width))
+    return inputs._replace(pyramid=build_pyramid(known, spec.max_radius_px))
+
+
+def _stored(planes: Tensor, pyramid: Pyramid | None) -> Tensor:
+    """(B, N, L, 4) of all pixels, or (1, M, L, 4) of all texels of the pyramid: copies, so that what is read lies together."""
+    return planes if pyramid is None else planes.flatten(0, 1)[pyramid.pixel][None]
 
 
 class _Block(NamedTuple):
@@ -171,10 +191,11 @@ class _March(NamedTuple):
     name: str = "ray_march_visibility"
 
     def value(self, *tensors: Tensor | None) -> Outputs:
-        inputs = _inputs(tensors)
+        inputs = _inputs(tensors, self.spec)
+        stored = _stored(inputs.planes, inputs.pyramid)
         total, weight = torch.zeros_like(inputs.reach), torch.zeros_like(inputs.reach)
         for block in self.blocks(inputs):
-            piece = _Piece(self, block, inputs)
+            piece = _Piece(self, block, inputs, stored)
             total[block.images, block.pixels] += piece.visibility(*piece.leaves)[0]
             weight[block.images, block.pixels] += piece.weight.sum(0)
         seen = inputs.valid[:, :, 0] & (weight > 0)
@@ -183,32 +204,39 @@ class _March(NamedTuple):
     def pull_back(
         self, grad: Tensor, needed: Sequence[bool], outputs: Outputs, *tensors: Tensor | None
     ) -> list[Tensor]:
-        inputs = _inputs(tensors)
+        inputs = _inputs(tensors, self.spec)
+        stored = _stored(inputs.planes, inputs.pyramid)
         per_ray = grad / outputs[1]
         totals = [None if t is None else torch.zeros_like(t) for t in inputs[:5]]
-        planes = torch.zeros_like(inputs.planes)
-        flat = planes.view(-1, planes.shape[2] * 4)
+        to_stored = torch.zeros_like(stored)
+        flat = to_stored.view(-1, stored.shape[2] * 4)
         for block in self.blocks(inputs):
-            piece = _Piece(self, block, inputs)
+            piece = _Piece(self, block, inputs, stored)
             *parts, rows = pull_back(piece.visibility, piece.leaves, [per_ray[block.images, block.pixels]])
             targets = [target for target in block.cut(totals) if target is not None]
             for target, part in zip(targets, parts, strict=True):
                 target += part
             if needed[5]:
                 flat.index_add_(0, piece.rows_at.flatten(), rows.flatten(0, -3).flatten(1))
+        planes = to_stored
+        if inputs.pyramid is not None:
+            planes = torch.zeros_like(inputs.planes)
+            planes.view(-1, flat.shape[1]).index_add_(0, inputs.pyramid.pixel, flat)
         return [total for total, want in zip([*totals, planes], needed, strict=False) if want and total is not None]
 
     def push_forward(self, tangents: Sequence[Tensor | None], outputs: Outputs, *tensors: Tensor | None) -> Tensor:
-        inputs = _inputs(tensors)
+        inputs = _inputs(tensors, self.spec)
+        stored = _stored(inputs.planes, inputs.pyramid)
         moves = [
             None if t is None else (torch.zeros_like(t) if move is None else move)
             for t, move in zip(inputs[:6], tangents[:6], strict=True)
         ]
         total = torch.zeros_like(inputs.reach)
+        moved = _stored(moves[5], inputs.pyramid)  # type: ignore[arg-type]
         for block in self.blocks(inputs):
-            piece = _Piece(self, block, inputs)
+            piece = _Piece(self, block, inputs, stored)
             leaves = [move for move in block.cut(moves[:5]) if move is not None]
-            leaves.append(_rows(moves[5], piece.rows_at))  # type: ignore[arg-type]
+            leaves.append(_rows(moved, piece.rows_at))
             (pushed,) = push_forward(piece.visibility, piece.leaves, leaves)
             total[block.images, block.pixels] += pushed
         return total / outputs[1]
@@ -228,7 +256,7 @@ class _March(NamedTuple):
 class _Piece:
     """The rays of a block: where their steps fall, and their visibility as a function of the differentiable inputs."""
 
-    def __init__(self, kernel: _March, block: _Block, inputs: _Inputs) -> None:
+    def __init__(self, kernel: _March, block: _Block, inputs: _Inputs, stored: Tensor) -> None:
         self.spec = spec = kernel.spec
         noise = kernel.rotation[block.pixels], kernel.offset[block.pixels]
         self.sampling = kernel.disk[block.rays], len(kernel.disk), *noise
@@ -238,7 +266,7 @@ class _Piece:
         place = hit.march(pixels, hit.directions(pixels.normal, *self.sampling), spec.steps)
         self.steps = _read(place, inputs, block, spec)
         self.weight = self.steps.seen.to(pixels.reach.dtype).mean(0)
-        rows = _rows(inputs.planes, self.steps.sample)
+        rows = _rows(stored, self.steps.sample)
         behind, height = hit.depth_behind(place, rows, spec.orthographic)
         thickness = None if pixels.thickness is None else pixels.thickness * pixels.reach
         known = self.steps.known
@@ -250,7 +278,7 @@ class _Piece:
             pair = torch.cat(((self.first - 1).clamp(min=0), self.first))
             self.rows_at = self.steps.sample.gather(0, pair)
             self.pair_known = torch.stack([known[..., layer].gather(0, pair) for layer in range(known.shape[-1])], -1)
-            rows = _rows(inputs.planes, self.rows_at)
+            rows = _rows(stored, self.rows_at)
         self.leaves = [*(part for part in cut if part is not None), rows]
 
     def visibility(self, *leaves: Tensor) -> tuple[Tensor]:
@@ -292,16 +320,23 @@ class _Piece:
 
 
 def _read(place: Tensor, inputs: _Inputs, block: _Block, spec: _Spec) -> Steps:
-    """Whole-pixel positions of steps."""
+    """Whole-pixel positions of steps, and which samples they read."""
     x, y, z = place
     fx, fy, cx, cy = inputs.intrinsics[block.images].T[:, :, None]
     ahead = z > 0
     scale = 1.0 if spec.orthographic else 1 / torch.where(ahead, z, 1.0)
     column, row = fx * x * scale + cx, fy * y * scale + cy
     seen = ahead & (column >= 0) & (column < spec.width) & (row >= 0) & (row < spec.height)
-    first = torch.arange(len(inputs.reach), device=x.device)[block.images, None] * inputs.reach.shape[1]
-    index = torch.where(seen, row, 0.0).long() * spec.width + torch.where(seen, column, 0.0).long() + first
-    known = inputs.valid.reshape(-1, inputs.valid.shape[2])[index]
+    row_at, column_at = torch.where(seen, row, 0.0).long(), torch.where(seen, column, 0.0).long()
+    image = torch.arange(len(inputs.reach), device=x.device)[block.images, None]
+    if inputs.pyramid is None:
+        index = pixel = row_at * spec.width + column_at + image * inputs.reach.shape[1]
+    else:
+        own = torch.arange(inputs.reach.shape[1], device=x.device)[block.pixels]
+        down, across = row - (own // spec.width + 0.5), column - (own % spec.width + 0.5)
+        index = texels_at(inputs.pyramid, image, row_at, column_at, torch.maximum(down.abs(), across.abs()))
+        pixel = inputs.pyramid.pixel[index]
+    known = inputs.valid.reshape(-1, inputs.valid.shape[2])[pixel]
     return Steps(seen, index, known)
 
 

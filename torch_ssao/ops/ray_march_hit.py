@@ -32,7 +32,7 @@ class Steps(NamedTuple):
     """Where steps fall: the same in every derivative."""
 
     seen: Tensor  # (J, K, b, P) bool: inside the image and in front of the eye
-    sample: Tensor  # (J, K, b, P) row of the stored samples
+    sample: Tensor  # (J, K, b, P) row of the stored samples: of the pixels, or of the texels of the pyramid
     known: Tensor  # (J, K, b, P, L) bool: stored sample is valid
 
 
