@@ -54,9 +54,7 @@ def ray_march_visibility(
     surrogate_width: float = 0.05,
     max_radius_px: float | None = None,
 ) -> Tensor:
-    """Visibility of every pixel from rays marched through the depth layers.
-
-    How rays march, what a hit is and what the screen's edge does: see the module.
+    """Visibility of every pixel from rays marched through the depth layers; the module says how.
 
     Args:
         points: (B, 3, L, H, W) view-space positions, scene units, finite everywhere.
@@ -88,6 +86,7 @@ def ray_march_visibility(
     checks.check_positive("surrogate_width", surrogate_width)
     height, width = valid.shape[2:]
     spec = _Spec(steps, height, width, orthographic, gradient, surrogate_width, max_radius_px)
+    planes = tangent_planes(points, normal, valid, intrinsics, orthographic=orthographic).flatten(2, 3)
     visibility = recompute(
         _March(spec, disk, rotation.reshape(-1), offset.reshape(-1)),
         points[:, :, 0].flatten(2),
@@ -95,10 +94,7 @@ def ray_march_visibility(
         reach.flatten(1),
         falloff,
         thickness,
-        tangent_planes(points, normal, valid, intrinsics, orthographic=orthographic)
-        .flatten(2, 3)
-        .transpose(1, 2)
-        .contiguous(),
+        planes.transpose(1, 2).contiguous(),
         valid.flatten(2).transpose(1, 2),
         intrinsics.detach(),
     )
