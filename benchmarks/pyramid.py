@@ -4,7 +4,8 @@
 
 On two built-in scenes, with a radius that spans up to about 200 pixels (the 95th percentile over the image), caps of 8, 16, 32
 and 64 pixels and none: mean change and RMSE against no cap, bias and RMSE against a ray-traced reference, milliseconds on one
-thread. Everything else is at its default; the reference has the technique's own falloff. Rows: benchmarks/results/pyramid.json.
+thread. Everything else is at its default; the reference has the technique's own falloff. Rows go to
+benchmarks/results/pyramid.json, beside those of other scenes.
 """
 
 from __future__ import annotations
@@ -74,7 +75,8 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     width, height = map(int, arguments.size.split("x"))
-    rows = []
+    before = json.loads(RESULTS.read_text(encoding="utf-8"))["rows"] if RESULTS.exists() else []
+    rows = [row for row in before if row["scene"] not in arguments.scenes]
     for name in arguments.scenes:
         rows += measure(name, height, width, arguments.samples, arguments.repeats)
     record = {"environment": environment(), "size": [height, width], "samples": arguments.samples, "rows": rows}

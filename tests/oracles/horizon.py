@@ -342,6 +342,27 @@ def make_tap(
     return Tap(place, ray / np.linalg.norm(ray), float(offset @ along), float(-offset @ view), reach, True)
 
 
+def bent_normals(*images: npt.ArrayLike, samples: int, **settings: Any) -> Floats:
+    """(B, 3, H, W) mean occluded directions, 0 at invalid pixels; `images` and `settings` as for `horizon_obscurance`."""
+    z, n, turn, shift = (np.asarray(images[i], dtype=np.float64) for i in (0, 2, 4, 5))
+    seen, result = np.asarray(images[1], dtype=bool), np.zeros(n.shape)
+    for image, numbers in enumerate(np.asarray(images[3], dtype=np.float64)):
+        s = Settings(*map(float, numbers), **settings)
+        for row, column in np.argwhere(seen[image]):
+            pixel = (
+                z[image],
+                seen[image],
+                n[image, :, row, column],
+                row,
+                column,
+                turn[row, column],
+                shift[row, column],
+            )
+            span = s.radius * max(s.fx, s.fy) / (1.0 if s.orthographic else z[image, row, column])
+            result[image, :, row, column] = fade(span) * pixel_occluded_direction(samples, *pixel, s)
+    return result
+
+
 def horizon_obscurance(
     depth: npt.ArrayLike,
     valid: npt.ArrayLike,
