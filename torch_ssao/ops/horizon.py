@@ -18,7 +18,7 @@ footprint's size, differenced over +-`FOOTPRINT_STEP` of it with the same noise 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -78,10 +78,8 @@ def horizon_obscurance(
         weighting: "cosine" or "uniform".
         estimator: "increments" or "bitmask".
         connected: "bitmask" also covers the arcs between neighbouring taps of one surface.
-        max_radius_px: taps further than this many pixels away read a coarser level of a pyramid of selected pixels
-            (`ops.depth_pyramid`), whose plane stands for more of the image: reads stay near each other, and what lies between
-            the selected pixels may be missed. R is shortened where it spans more than 32 times as much. None: every tap
-            reads its own pixel.
+        max_radius_px: taps further than this many pixels away read a pyramid of selected pixels (`ops.depth_pyramid`): reads
+            stay near each other, what lies between the pixels may be missed. R spans at most 32 times as many. None: no cap.
         offscreen: taps off the image never occlude ("open"), or meet the plane of the nearest pixel ("extend").
         footprint_step: of the footprint, over which its effect is differenced in derivatives.
     Returns: (B, H, W) obscurance in [0, 1]; it fades out where R spans less than a pixel (`ops.footprint`).
@@ -93,20 +91,13 @@ def horizon_obscurance(
     Raises: ChoiceError.
     Source: HBAO (Bavoil, Sainz, Dimitrov 2008), GTAO (Jimenez et al. 2016), visibility bitmasks (Therrien et al. 2023).
     """
-    obscurance, _ = evaluate_horizon(
-        *(depth, valid, normal, intrinsics, radius, falloff, thickness, bias, rotation, offset),
-        orthographic=orthographic,
-        slices=slices,
-        steps=steps,
-        step_power=step_power,
-        weighting=weighting,
-        estimator=estimator,
-        connected=connected,
-        max_radius_px=max_radius_px,
-        offscreen=offscreen,
-        footprint_step=footprint_step,
-    )
-    return torch.where(valid, obscurance[:, 0], 0.0).clamp(0, 1)
+    form: dict[str, Any] = {"weighting": weighting, "estimator": estimator, "connected": connected}
+    layout: dict[str, Any] = {"slices": slices, "steps": steps, "step_power": step_power, "offscreen": offscreen}
+    rest: dict[str, Any] = {"max_radius_px": max_radius_px, "footprint_step": footprint_step}
+    tensors: tuple[Any, ...] = (depth, valid, normal, intrinsics, radius, falloff, thickness, bias, rotation, offset)
+    options = form | layout | rest
+    found, _ = evaluate_horizon(*tensors, orthographic=orthographic, **options)
+    return torch.where(valid, found[:, 0], 0.0).clamp(0, 1)
 
 
 def evaluate_horizon(
