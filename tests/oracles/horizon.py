@@ -10,6 +10,7 @@ distribution of GT-VBAO.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -171,8 +172,12 @@ def connected(tap: Tap, before: Tap | None, slope: float) -> bool:
     return across > 0 and abs(rise) <= slope * across
 
 
-def side_increments(taps: list[Tap], plane: Slice, side: int, radius: float, s: Settings) -> float:
-    total, horizon, earlier = 0.0, s.bias, 1.0
+Arcs = list[tuple[float, float, float]]  # weight, lower and upper elevation
+
+
+def side_rises(taps: list[Tap], plane: Slice, side: int, radius: float, s: Settings) -> Arcs:
+    """The arcs by which taps raise the horizon."""
+    arcs, horizon, earlier = [], s.bias, 1.0
     for number, tap in enumerate(taps):
         distance = math.hypot(tap.along, tap.towards) if tap.seen else tap.reach
         weight = max(0.0, 1.0 - (distance / radius) ** s.falloff)
@@ -188,13 +193,24 @@ def side_increments(taps: list[Tap], plane: Slice, side: int, radius: float, s: 
                     if connected(tap, taps[number - 1] if number else None, TRAPEZOID)
                     else weight
                 )
-                total += mean * (plane.share_below(elevation, side) - plane.share_below(start, side))
+                arcs.append((mean, start, elevation))
                 horizon = elevation
         earlier = weight
-    return total
+    return arcs
+
+
+def side_increments(taps: list[Tap], plane: Slice, side: int, radius: float, s: Settings) -> float:
+    arcs = side_rises(taps, plane, side, radius, s)
+    return sum(w * (plane.share_below(high, side) - plane.share_below(low, side)) for w, low, high in arcs)
 
 
 def side_union(taps: list[Tap], plane: Slice, side: int, radius: float, s: Settings) -> float:
+    arcs = side_covered(taps, plane, side, radius, s)
+    return merged_length([(plane.share_below(low, side), plane.share_below(high, side)) for _, low, high in arcs])
+
+
+def side_covered(taps: list[Tap], plane: Slice, side: int, radius: float, s: Settings) -> Arcs:
+    """The arcs that occluders cover; they overlap."""
     arcs = []
     thick = math.inf if s.thickness is None else s.thickness * radius
     for number, tap in enumerate(taps):
@@ -218,13 +234,39 @@ def side_union(taps: list[Tap], plane: Slice, side: int, radius: float, s: Setti
     for low, high in arcs:
         high = max(high, s.bias)
         low = min(max(low, s.bias), high)
-        clipped.append((plane.share_below(low, side), plane.share_below(high, side)))
-    return merged_length(clipped)
+        clipped.append((1.0, low, high))
+    return clipped
 
 
-def pixel_obscurance(
+def pixel_obscurance(*pixel: Any) -> float:
+    """Of what `half_slices` yields for a pixel."""
+    total, s = 0.0, pixel[-1]
+    for taps, plane, side, radius in half_slices(*pixel):
+        judge = side_increments if s.estimator == "increments" else side_union
+        total += judge(taps, plane, side, radius, s)
+    return total / s.slices
+
+
+def pixel_occluded_direction(samples: int, *pixel: Any) -> Floats:
+    """Integral of the occluded directions over the hemisphere, over its measure, by the midpoint rule in every half slice."""
+    total, s = np.zeros(3), pixel[-1]
+    for taps, plane, side, radius in half_slices(*pixel):
+        arcs = (side_rises if s.estimator == "increments" else side_covered)(taps, plane, side, radius, s)
+        limit = math.pi / 2 - side * plane.gamma  # the elevation of the view
+        step = limit / samples
+        elevation = (np.arange(samples) + 0.5) * step
+        weights = [w * ((elevation > low) & (elevation < high)) for w, low, high in arcs]
+        occluded = np.max(weights, axis=0) if weights else np.zeros(samples)
+        directions = side * np.cos(elevation)[:, None] * plane.out + np.sin(elevation)[:, None] * plane.up
+        density = np.sin(limit - elevation) * (plane.length * np.sin(elevation) if s.cosine else 0.5)
+        total += (occluded * density) @ directions * step
+    return total / s.slices
+
+
+def half_slices(
     depth: Floats, valid: Any, normal: Floats, row: int, column: int, rotation: float, offset: float, s: Settings
-) -> float:
+) -> Iterator[tuple[list[Tap], Slice, int, float]]:
+    """Taps, plane, side and radius of the half slices of a pixel."""
     centre = np.array([column + 0.5, row + 0.5])
     origin, direction = s.ray(*centre)
     point = origin + depth[row, column] * direction
@@ -237,7 +279,6 @@ def pixel_obscurance(
     if not s.orthographic:
         wide /= math.sqrt(1 - min(radius / float(np.linalg.norm(point)), WIDEST) ** 2)
     one, two = turned_axes(view)
-    total = 0.0
     for number in range(s.slices):
         angle = math.pi * (number + rotation) / s.slices
         along = math.cos(angle) * one + math.sin(angle) * two
@@ -260,9 +301,7 @@ def pixel_obscurance(
                 taps.append(
                     make_tap(depth, valid, centre, point, view, side * along, side * exact, pixels, recession * side, s)
                 )
-            judge = side_increments if s.estimator == "increments" else side_union
-            total += judge(taps, plane, side, radius, s)
-    return total / s.slices
+            yield taps, plane, side, radius
 
 
 def make_tap(
@@ -301,6 +340,27 @@ def make_tap(
     place = origin + (level if s.orthographic else 1.0 / level) * ray
     offset = place - point
     return Tap(place, ray / np.linalg.norm(ray), float(offset @ along), float(-offset @ view), reach, True)
+
+
+def bent_normals(*images: npt.ArrayLike, samples: int, **settings: Any) -> Floats:
+    """(B, 3, H, W) mean occluded directions, 0 at invalid pixels; `images` and `settings` as for `horizon_obscurance`."""
+    z, n, turn, shift = (np.asarray(images[i], dtype=np.float64) for i in (0, 2, 4, 5))
+    seen, result = np.asarray(images[1], dtype=bool), np.zeros(n.shape)
+    for image, numbers in enumerate(np.asarray(images[3], dtype=np.float64)):
+        s = Settings(*map(float, numbers), **settings)
+        for row, column in np.argwhere(seen[image]):
+            pixel = (
+                z[image],
+                seen[image],
+                n[image, :, row, column],
+                row,
+                column,
+                turn[row, column],
+                shift[row, column],
+            )
+            span = s.radius * max(s.fx, s.fy) / (1.0 if s.orthographic else z[image, row, column])
+            result[image, :, row, column] = fade(span) * pixel_occluded_direction(samples, *pixel, s)
+    return result
 
 
 def horizon_obscurance(

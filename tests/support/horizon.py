@@ -17,7 +17,10 @@ def smooth_gbuffer(**options: object) -> ts.GBuffer:
     return ts.GBuffer(depth, gb.camera, normal=gb.normal, valid=gb.valid)
 
 
-def evaluate(gb: ts.GBuffer, *, frame: int = 0, **options: object) -> torch.Tensor:
+def question(
+    gb: ts.GBuffer, *, frame: int = 0, **options: object
+) -> tuple[tuple[torch.Tensor, ...], dict[str, object]]:
+    """Tensors and keywords of the operators."""
     given = {"radius": 0.7, "falloff": 2.5, "thickness": 0.4, "bias": 0.05} | options
     batch, dtype = len(gb), gb.depth.dtype
     scalars = [given.pop(name) for name in ("radius", "falloff", "thickness", "bias")]
@@ -25,19 +28,20 @@ def evaluate(gb: ts.GBuffer, *, frame: int = 0, **options: object) -> torch.Tens
     camera = gb.camera
     valid = gb.valid_mask[:, 0]
     noise = tiled_noise(camera.height, camera.width, frame, dtype=dtype, device=torch.device("cpu"))
-    return horizon_obscurance(
-        torch.where(valid, gb.depth[:, 0], 1.0),
-        valid,
-        gb.normal,
-        torch.stack((camera.fx, camera.fy, camera.cx, camera.cy), 1).to(dtype),
-        *values,
-        *noise,
-        orthographic=camera.is_orthographic,
-        **({"slices": 2, "steps": 3, "step_power": 1.3, "weighting": "cosine", "estimator": "bitmask"} | given),
-    )
+    intrinsics = torch.stack((camera.fx, camera.fy, camera.cx, camera.cy), 1).to(dtype)
+    tensors = (torch.where(valid, gb.depth[:, 0], 1.0), valid, gb.normal, intrinsics, *values, *noise)
+    defaults = {"slices": 2, "steps": 3, "step_power": 1.3, "weighting": "cosine", "estimator": "bitmask"}
+    return tensors, {"orthographic": camera.is_orthographic} | defaults | given
 
 
-def expected(gb: ts.GBuffer, **options: object) -> torch.Tensor:
+def evaluate(gb: ts.GBuffer, *, frame: int = 0, **options: object) -> torch.Tensor:
+    """The operator's obscurance."""
+    tensors, keywords = question(gb, frame=frame, **options)
+    return horizon_obscurance(*tensors, **keywords)
+
+
+def oracle_question(gb: ts.GBuffer, **options: object) -> tuple[tuple[torch.Tensor, ...], dict[str, object]]:
+    """Images and settings of the oracles."""
     camera = gb.camera
     noise = tiled_noise(camera.height, camera.width, 0, dtype=torch.float64, device=torch.device("cpu"))
     given = {
@@ -46,12 +50,15 @@ def expected(gb: ts.GBuffer, **options: object) -> torch.Tensor:
     } | options  # fmt: skip
     given["extend"] = given.pop("offscreen", "open") == "extend"
     given["cosine"] = given.pop("weighting") == "cosine"
-    image = oracle(
-        gb.depth[:, 0], gb.valid[:, 0], gb.normal,
-        torch.stack((camera.fx, camera.fy, camera.cx, camera.cy), 1), *noise,
-        orthographic=camera.is_orthographic, eps=torch.finfo(torch.float64).eps, **given,
-    )  # fmt: skip
-    return torch.from_numpy(image)
+    intrinsics = torch.stack((camera.fx, camera.fy, camera.cx, camera.cy), 1)
+    settings = {"orthographic": camera.is_orthographic, "eps": torch.finfo(torch.float64).eps} | given
+    return (gb.depth[:, 0], gb.valid[:, 0], gb.normal, intrinsics, *noise), settings
+
+
+def expected(gb: ts.GBuffer, **options: object) -> torch.Tensor:
+    """The oracle's obscurance."""
+    images, settings = oracle_question(gb, **options)
+    return torch.from_numpy(oracle(*images, **settings))
 
 
 FORMS = [

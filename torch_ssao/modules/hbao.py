@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import final
+from typing import Any, final
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from torch_ssao import checks
 from torch_ssao.camera import Camera
-from torch_ssao.modules.base import AmbientVisibility, ParameterSpec, Positive
+from torch_ssao.gbuffer import GBuffer
+from torch_ssao.modules.base import AmbientVisibility, ParameterSpec, Positive, _repaired, _wide
+from torch_ssao.ops.falloff import contrast_power
 from torch_ssao.ops.horizon import ESTIMATORS, OFFSCREEN, WEIGHTINGS, horizon_obscurance
+from torch_ssao.ops.horizon_bent import horizon_bent_normal
 from torch_ssao.ops.normals import normals_from_points
 from torch_ssao.ops.sampling import tiled_noise
 
@@ -135,13 +139,46 @@ class HBAO(AmbientVisibility):
     def _visibility(
         self, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera, *, frame: int, backend: str
     ) -> Tensor:
+        tensors, options = self._question(depth, valid, normal, camera, frame)
+        return 1 - horizon_obscurance(*tensors, **options)
+
+    def bent_normal(self, gbuffer: GBuffer, *, frame: int = 0) -> tuple[Tensor, Tensor]:
+        """Visibility and the mean open direction of every pixel, from the same taps.
+
+        Args:
+            gbuffer, frame: as for `forward`.
+        Returns: (B, 1, H, W) visibility, that of `forward`; and (B, 3, H, W) unit directions in view space, cosine-weighted with
+            weighting "cosine", all alike with "uniform": the normal where nothing is occluded or nothing is open, (0, 0, -1) at
+            invalid pixels. The denoiser and the contrast leave them as they are.
+        Gradients: to depth, normal, camera and the module's parameters.
+        """
+        if gbuffer.depth.ndim == 3:  # inside vmap
+            batched = pytree.tree_map(lambda leaf: leaf.unsqueeze(0), gbuffer)
+            visibility, bent = self.bent_normal(batched, frame=frame)
+            return visibility.squeeze(0), bent.squeeze(0)
+        with torch.autocast(device_type=gbuffer.depth.device.type, enabled=False):
+            valid = gbuffer.valid_mask
+            depth = _wide(torch.where(valid, gbuffer.depth, 1.0))  # as in `forward`
+            normal = None if gbuffer.normal is None else _wide(_repaired(gbuffer.normal, valid[:, :1]))
+            tensors, options = self._question(depth, valid, normal, gbuffer.camera, frame)
+            obscurance, bent = horizon_bent_normal(*tensors, **options)
+            visibility = 1 - obscurance
+            if self.denoise:
+                visibility = self._denoised(visibility, depth, valid, normal, gbuffer.camera)
+            visibility = contrast_power(visibility, self.contrast.to(visibility.dtype))
+            return torch.where(valid[:, :1], visibility[:, None], 1.0), bent
+
+    def _question(
+        self, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera, frame: int
+    ) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """Tensors and keywords of the operators."""
         batch, dtype = depth.shape[0], depth.dtype
         nearest, seen = depth[:, 0], valid[:, 0]
         if normal is None:
             normal = normals_from_points(camera.unproject(depth[:, :1])[:, :, 0], seen)
         intrinsics = torch.stack((camera.fx, camera.fy, camera.cx, camera.cy), 1).to(dtype)
         rotation, offset = tiled_noise(camera.height, camera.width, frame, dtype=dtype, device=depth.device)
-        obscurance = horizon_obscurance(
+        tensors = (
             nearest,
             seen,
             normal,
@@ -152,14 +189,6 @@ class HBAO(AmbientVisibility):
             (self.bias_deg * (math.pi / 180)).to(dtype).expand(batch),
             rotation,
             offset,
-            orthographic=camera.is_orthographic,
-            slices=self.slices,
-            steps=self.steps,
-            step_power=self.step_power,
-            weighting=self.weighting,
-            estimator=self.estimator,
-            connected=self.connected,
-            max_radius_px=self.max_radius_px,
-            offscreen=self.offscreen,
         )
-        return 1 - obscurance
+        names = ("slices", "steps", "step_power", "weighting", "estimator", "connected", "max_radius_px", "offscreen")
+        return tensors, {"orthographic": camera.is_orthographic} | {name: getattr(self, name) for name in names}

@@ -5,6 +5,7 @@ from torch_ssao.ops.falloff import attenuation as attenuation
 from torch_ssao.ops.falloff import contrast_power as contrast_power
 from torch_ssao.ops.falloff import psi as psi
 from torch_ssao.ops.horizon import horizon_obscurance as horizon_obscurance
+from torch_ssao.ops.horizon_bent import horizon_bent_normal as horizon_bent_normal
 from torch_ssao.ops.normals import normals_from_points as normals_from_points
 from torch_ssao.ops.partition import adaptive_labels as adaptive_labels
 from torch_ssao.ops.partition import uniform_labels as uniform_labels

@@ -18,7 +18,7 @@ footprint's size, differenced over +-`FOOTPRINT_STEP` of it with the same noise 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,6 +28,7 @@ from torch_ssao.ops import horizon_arcs as arcs
 from torch_ssao.ops import horizon_taps as taps
 from torch_ssao.ops.depth_pyramid import Pyramid, build_pyramid
 from torch_ssao.ops.footprint import footprint_fade
+from torch_ssao.ops.horizon_moments import occluded_moments
 from torch_ssao.ops.recompute import Outputs, pull_back, push_forward, recompute
 
 BLOCK = {"cpu": 2**18, "cuda": 2**21}  # taps worked on at a time: what fits a cache, what fills a GPU
@@ -77,10 +78,8 @@ def horizon_obscurance(
         weighting: "cosine" or "uniform".
         estimator: "increments" or "bitmask".
         connected: "bitmask" also covers the arcs between neighbouring taps of one surface.
-        max_radius_px: taps further than this many pixels away read a coarser level of a pyramid of selected pixels
-            (`ops.depth_pyramid`), whose plane stands for more of the image: reads stay near each other, and what lies between
-            the selected pixels may be missed. R is shortened where it spans more than 32 times as much. None: every tap
-            reads its own pixel.
+        max_radius_px: taps further than this many pixels away read a pyramid of selected pixels (`ops.depth_pyramid`): reads
+            stay near each other, what lies between the pixels may be missed. R spans at most 32 times as many. None: no cap.
         offscreen: taps off the image never occlude ("open"), or meet the plane of the nearest pixel ("extend").
         footprint_step: of the footprint, over which its effect is differenced in derivatives.
     Returns: (B, H, W) obscurance in [0, 1]; it fades out where R spans less than a pixel (`ops.footprint`).
@@ -92,16 +91,53 @@ def horizon_obscurance(
     Raises: ChoiceError.
     Source: HBAO (Bavoil, Sainz, Dimitrov 2008), GTAO (Jimenez et al. 2016), visibility bitmasks (Therrien et al. 2023).
     """
+    form: dict[str, Any] = {"weighting": weighting, "estimator": estimator, "connected": connected}
+    layout: dict[str, Any] = {"slices": slices, "steps": steps, "step_power": step_power, "offscreen": offscreen}
+    rest: dict[str, Any] = {"max_radius_px": max_radius_px, "footprint_step": footprint_step}
+    tensors: tuple[Any, ...] = (depth, valid, normal, intrinsics, radius, falloff, thickness, bias, rotation, offset)
+    options = form | layout | rest
+    found, _ = evaluate_horizon(*tensors, orthographic=orthographic, **options)
+    return torch.where(valid, found[:, 0], 0.0).clamp(0, 1)
+
+
+def evaluate_horizon(
+    depth: Tensor,
+    valid: Tensor,
+    normal: Tensor,
+    intrinsics: Tensor,
+    radius: Tensor,
+    falloff: Tensor,
+    thickness: Tensor | None,
+    bias: Tensor,
+    rotation: Tensor,
+    offset: Tensor,
+    *,
+    orthographic: bool,
+    slices: int,
+    steps: int,
+    step_power: float,
+    weighting: str,
+    estimator: str,
+    connected: bool = False,
+    max_radius_px: float | None = None,
+    offscreen: str = "open",
+    footprint_step: float = FOOTPRINT_STEP,
+    bent: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Obscurance and, with `bent`, the mean direction of what is occluded: `horizon_obscurance` says how.
+
+    Returns: (B, 1 or 4, H, W), not clamped, meaningless at invalid pixels; and the normals that were used.
+    """
     checks.check_choice("weighting", weighting, WEIGHTINGS)
     checks.check_choice("estimator", estimator, ESTIMATORS)
     checks.check_choice("offscreen", offscreen, OFFSCREEN)
     normal = _usable(normal, valid)
     planes = taps.surface_planes(depth, valid, intrinsics[:, :2], orthographic=orthographic)
     layout = taps.Layout(slices, steps, step_power, orthographic, max_radius_px, offscreen == "extend")
-    kernel = _Horizon(layout, weighting == "cosine", estimator, connected, rotation, offset, footprint_step)
-    obscurance = recompute(kernel, planes, valid, normal, intrinsics, radius, falloff, thickness, bias)[:, 0]
+    kernel = _Horizon(layout, weighting == "cosine", estimator, connected, rotation, offset, footprint_step, bent)
+    found = recompute(kernel, planes, valid, normal, intrinsics, radius, falloff, thickness, bias)
     fade = footprint_fade(depth, valid, radius[:, None, None], intrinsics[:, :2], orthographic=orthographic)
-    return torch.where(valid, obscurance * fade, 0.0).clamp(0, 1)
+    return found * fade[:, None], normal
 
 
 def _usable(normal: Tensor, valid: Tensor) -> Tensor:
@@ -145,6 +181,7 @@ class _Horizon(NamedTuple):
     rotation: Tensor
     offset: Tensor
     footprint_step: float
+    bent: bool  # obscurance and the mean direction of what is occluded, not obscurance alone
     name: str = "horizon_obscurance"
 
     def value(self, *tensors: Tensor | None) -> Outputs:
@@ -199,7 +236,7 @@ class _Horizon(NamedTuple):
         return None if cap is None or valid is None else build_pyramid(valid, cap)
 
     def _nothing(self, inputs: _Inputs) -> Tensor:
-        return inputs.planes.new_zeros(1, inputs.planes.shape[1])
+        return inputs.planes.new_zeros(4 if self.bent else 1, inputs.planes.shape[1])
 
     def _blocks(self, inputs: _Inputs) -> Iterator[_Block]:
         pixels = inputs.planes.shape[1]
@@ -239,7 +276,7 @@ class _Block:
         return [*self._own(inputs), read, *(t for t in inputs.scalars if t is not None)]
 
     def function(self, level: Tensor, normal: Tensor, read: Tensor, *rest: Tensor) -> Outputs:
-        """Obscurance (1, P) that this block adds."""
+        """Obscurance (1, P) that this block adds; with `bent` (4, P), with the mean occluded direction."""
         kernel, image = self.kernel, self.pixels.image
         intrinsics, radius, falloff = rest[:3]
         thickness = rest[3][image] if self.has_thickness else None
@@ -247,6 +284,16 @@ class _Block:
         frame = taps.make_frame(level, normal, intrinsics, radius, self.pixels, kernel.layout)
         found = taps.meet_surface(frame, self.pixels, self.texels, read)
         measure = arcs.Measure.of(frame, cosine=kernel.cosine)
+        if kernel.bent:
+            part = occluded_moments(
+                *(measure, frame, found, falloff[image], thickness, bias),
+                estimator=kernel.estimator,
+                connected=kernel.connected,
+            )
+            view, along = taps.slice_axes(intrinsics, self.pixels, kernel.layout)
+            amount, towards = part[:2].sum(2)
+            direction = towards.sum(0) * view + ((part[2, :, 0] - part[2, :, 1]) * along).sum(1)
+            return (torch.cat((amount.sum(0)[None], direction)) / kernel.layout.slices,)
         if kernel.estimator == "increments":
             amount = arcs.weighted_increments(measure, frame, found, falloff[image], thickness, bias)
         else:
@@ -254,7 +301,7 @@ class _Block:
         return (amount[None] / kernel.layout.slices,)
 
     def by_spread(self, inputs: _Inputs) -> Tensor:
-        """Derivative (1, P) to the logarithm of the taps' spread: a difference, since taps move by whole pixels."""
+        """Derivative (1 or 4, P) to the logarithm of the taps' spread: a difference, since taps move by whole pixels."""
         step = self.kernel.footprint_step
         further, nearer = (
             _Block(self.kernel, inputs, self.piece.start, self.piece.stop, self.slices, 1 + sign * step)

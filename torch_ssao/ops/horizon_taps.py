@@ -149,12 +149,7 @@ def make_frame(
     x, y = (pixels.column + 0.5 - cx) / fx, (pixels.row + 0.5 - cy) / fy
     stretch = (1 + x * x + y * y).sqrt()
     a, b, c = x / stretch, y / stretch, 1 / stretch  # from the eye to x
-    mixed = -a * b / (1 + c)
-    direction = (
-        cosine * (1 - a * a / (1 + c)) + sine * mixed,
-        cosine * mixed + sine * (1 - b * b / (1 + c)),
-        -cosine * a - sine * b,
-    )
+    direction = _slice_direction(a, b, c, cosine, sine)
     turned = direction[0] * normal[0] + direction[1] * normal[1] + direction[2] * normal[2]
     facing = -(a * normal[0] + b * normal[1] + c * normal[2])
     return Frame(
@@ -167,6 +162,19 @@ def make_frame(
         fy * (direction[1] - y * direction[2]) / depth,
         direction[2] / depth,
     )
+
+
+def slice_axes(intrinsics: Tensor, pixels: Pixels, layout: Layout) -> tuple[Tensor, Tensor]:
+    """Unit directions towards the eye (3, P) and along the slices (3, S, P)."""
+    cosine, sine = pixels.angle.cos(), pixels.angle.sin()
+    zero = torch.zeros_like(cosine)
+    if layout.orthographic:
+        return torch.stack((zero[0], zero[0], zero[0] - 1)), torch.stack((cosine, sine, zero))
+    fx, fy, cx, cy = intrinsics[pixels.image].unbind(1)
+    x, y = (pixels.column + 0.5 - cx) / fx, (pixels.row + 0.5 - cy) / fy
+    stretch = (1 + x * x + y * y).sqrt()
+    a, b, c = x / stretch, y / stretch, 1 / stretch
+    return -torch.stack((a, b, c)), torch.stack(_slice_direction(a, b, c, cosine, sine))
 
 
 class Texels(NamedTuple):
@@ -234,6 +242,16 @@ def meet_surface(frame: Frame, pixels: Pixels, texels: Texels, planes: Tensor) -
     reach, away = torch.where(seen, reach, 1.0), torch.where(seen, away, 1.0)
     scale = 1 / torch.where(seen, level * frame.depth * away, 1.0)
     return Taps(scale * reach, (1 - scale) * frame.distance, reach, seen)
+
+
+def _slice_direction(a: Tensor, b: Tensor, c: Tensor, cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(cosine, sine, 0) carried from the view direction z to (a, b, c) by the shortest turn."""
+    mixed = -a * b / (1 + c)
+    return (
+        cosine * (1 - a * a / (1 + c)) + sine * mixed,
+        cosine * mixed + sine * (1 - b * b / (1 + c)),
+        -cosine * a - sine * b,
+    )
 
 
 def _sides(like: Tensor) -> Tensor:

@@ -61,22 +61,19 @@ def ray_march_visibility(
         valid: (B, L, H, W) bool.
         normal: (B, 3, L, H, W) unit normals of each layer; layer 0's orient the hemisphere.
         reach: (B, H, W) length R of the rays, scene units, > 0.
-        falloff: (B,) exponent p of the attenuation, > 0.
-        thickness: (B,) of the reach, > 0; None for solids without end.
+        falloff, thickness: (B,) exponent p of the attenuation, > 0; of the reach, > 0, or None for solids without end.
         intrinsics: (B, 4) fx, fy, cx, cy in pixels.
-        disk: (K, 2) points inside the unit disk, one a ray, one a ring of equal area.
-        rotation, offset: (H, W) turns of the disk, and places of the points within their rings, in [0, 1): noise over
-            which the mean does not depend on the number of rays.
+        disk: (K, 2) points inside the unit disk, one a ray, one a ring of equal area: the mean does not depend on K.
+        rotation, offset: (H, W) noise in [0, 1): turns of the disk, and places of the points within their rings.
         steps: steps a ray, >= 1.
         orthographic: parallel projection along +z.
         gradient: "exact", "surrogate" or "soft", see the module.
         surrogate_width: width of the sigmoid, of the reach, > 0.
-        max_radius_px: steps further than this many pixels away read a coarser level of a pyramid of selected pixels
-            (`ops.depth_pyramid`). The reach stays what it is: who calls shortens it to `furthest_read`. None: every step
-            reads its own pixel.
+        max_radius_px: steps further than this many pixels away read a pyramid of selected pixels (`ops.depth_pyramid`); the
+            caller shortens the reach to `furthest_read`. None: no cap.
     Returns: (B, H, W) in [0, 1]; 1 at invalid pixels, and it fades to 1 where the reach spans less than a pixel.
-    Gradients: to points, normal, reach, falloff and (not "exact") thickness; to the camera through points, and to
-        intrinsics through the fading alone. Forward mode alike. Second derivatives raise a RuntimeError.
+    Gradients: to points, normal, reach, falloff and (not "exact") thickness; to intrinsics through the fading alone, and
+        to the camera through points. Forward mode alike. Second derivatives raise a RuntimeError.
     Cost: K steps reads of L samples; saved: the inputs and two floats a pixel, whatever the rays and steps.
     Raises: RangeError, ChoiceError.
     Source: Poisson-based ray-marched SSAO, Algorithm 1, Eqs. 1 and 2.
@@ -98,10 +95,8 @@ def ray_march_visibility(
         valid.flatten(2).transpose(1, 2),
         intrinsics.detach(),
     )
-    visibility = visibility.unflatten(1, (height, width))
-    depth, focal = points[:, 2, 0], intrinsics[:, :2]
-    fade = footprint_fade(depth, valid[:, 0], reach, focal, orthographic=orthographic)
-    return visibility + (1 - fade) * (1 - visibility)
+    fade = footprint_fade(points[:, 2, 0], valid[:, 0], reach, intrinsics[:, :2], orthographic=orthographic).flatten(1)
+    return (visibility + (1 - fade) * (1 - visibility)).unflatten(1, (height, width))
 
 
 def tangent_planes(points: Tensor, normal: Tensor, valid: Tensor, intrinsics: Tensor, *, orthographic: bool) -> Tensor:
