@@ -162,15 +162,27 @@ class AmbientVisibility(nn.Module, abc.ABC):
             batched = pytree.tree_map(lambda leaf: leaf.unsqueeze(0), gbuffer)
             return self.forward(batched, frame=frame, backend=backend).squeeze(0)
         with torch.autocast(device_type=gbuffer.depth.device.type, enabled=False):
-            valid = gbuffer.valid_mask
-            # Invalid samples get a harmless depth before any arithmetic: a NaN times a zero gradient is still NaN.
-            depth = _wide(torch.where(valid, gbuffer.depth, 1.0))
-            normal = None if gbuffer.normal is None else _unit(_wide(gbuffer.normal), valid[:, :1])
+            depth, valid, normal = self._prepared(gbuffer)
             visibility = self._visibility(depth, valid, normal, gbuffer.camera, frame=frame, backend=backend)
-            if self.denoise:
-                visibility = self._denoised(visibility, depth, valid, normal, gbuffer.camera)
-            visibility = contrast_power(visibility, self.contrast.to(visibility.dtype))
-            return torch.where(valid[:, :1], visibility[:, None], 1.0)
+            return self._finished(visibility, depth, valid, normal, gbuffer.camera)
+
+    @staticmethod
+    def _prepared(gbuffer: GBuffer) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Depth, validity and normals of a G-buffer as `_visibility` takes them."""
+        valid = gbuffer.valid_mask
+        # Invalid samples get a harmless depth before any arithmetic: a NaN times a zero gradient is still NaN.
+        depth = _wide(torch.where(valid, gbuffer.depth, 1.0))
+        normal = None if gbuffer.normal is None else _unit(_wide(gbuffer.normal), valid[:, :1])
+        return depth, valid, normal
+
+    def _finished(
+        self, visibility: Tensor, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera
+    ) -> Tensor:
+        """(B, 1, H, W): filtered, raised to the contrast, 1 at invalid pixels."""
+        if self.denoise:
+            visibility = self._denoised(visibility, depth, valid, normal, camera)
+        visibility = contrast_power(visibility, self.contrast.to(visibility.dtype))
+        return torch.where(valid[:, :1], visibility[:, None], 1.0)
 
     def _denoised(
         self, visibility: Tensor, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera

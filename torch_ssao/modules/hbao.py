@@ -12,8 +12,7 @@ from torch.utils import _pytree as pytree
 from torch_ssao import checks
 from torch_ssao.camera import Camera
 from torch_ssao.gbuffer import GBuffer
-from torch_ssao.modules.base import AmbientVisibility, ParameterSpec, Positive, _repaired, _wide
-from torch_ssao.ops.falloff import contrast_power
+from torch_ssao.modules.base import AmbientVisibility, ParameterSpec, Positive
 from torch_ssao.ops.horizon import ESTIMATORS, OFFSCREEN, WEIGHTINGS, horizon_obscurance
 from torch_ssao.ops.horizon_bent import horizon_bent_normal
 from torch_ssao.ops.normals import normals_from_points
@@ -90,14 +89,14 @@ class HBAO(AmbientVisibility):
         *,
         falloff: float = 8.0,
         contrast: float = 1.0,
-        slices: int = 4,
-        steps: int = 4,
+        slices: int = 2,
+        steps: int = 8,
         weighting: str = "cosine",
         estimator: str = "bitmask",
         thickness: float | None = 0.8,
         bias_deg: float = 0.0,
         step_power: float = 1.3,
-        connected: bool = True,
+        connected: bool = False,
         max_radius_px: float | None = None,
         offscreen: str = "open",
         denoise: int = 0,
@@ -157,16 +156,10 @@ class HBAO(AmbientVisibility):
             visibility, bent = self.bent_normal(batched, frame=frame)
             return visibility.squeeze(0), bent.squeeze(0)
         with torch.autocast(device_type=gbuffer.depth.device.type, enabled=False):
-            valid = gbuffer.valid_mask
-            depth = _wide(torch.where(valid, gbuffer.depth, 1.0))  # as in `forward`
-            normal = None if gbuffer.normal is None else _wide(_repaired(gbuffer.normal, valid[:, :1]))
+            depth, valid, normal = self._prepared(gbuffer)
             tensors, options = self._question(depth, valid, normal, gbuffer.camera, frame)
             obscurance, bent = horizon_bent_normal(*tensors, **options)
-            visibility = 1 - obscurance
-            if self.denoise:
-                visibility = self._denoised(visibility, depth, valid, normal, gbuffer.camera)
-            visibility = contrast_power(visibility, self.contrast.to(visibility.dtype))
-            return torch.where(valid[:, :1], visibility[:, None], 1.0), bent
+            return self._finished(1 - obscurance, depth, valid, normal, gbuffer.camera), bent
 
     def _question(
         self, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera, frame: int
