@@ -112,8 +112,9 @@ def _xegtao(preset: str, *, tuned: bool) -> Model:
 TECHNIQUES = {
     "StatVO 4 layers": Model(_statvo()),
     "HBAO bitmask 3x3, connected": _bitmask(3, 3, connected=True),
+    "HBAO bitmask 3x6, connected": _bitmask(3, 6, connected=True),
     "HBAO bitmask 2x8": _bitmask(2, 8),
-    "HBAO bitmask 2x8, connected": _bitmask(2, 8, connected=True, like="HBAO bitmask 2x8"),
+    "HBAO bitmask 2x8, connected": _bitmask(2, 8, connected=True, like="HBAO bitmask 3x6, connected"),
     "HBAO bitmask 2x8, open border": _bitmask(2, 8, offscreen="open", like="HBAO bitmask 2x8"),
     "HBAO bitmask 4x4": _bitmask(4, 4, like="HBAO bitmask 2x8"),
     "HBAO bitmask 4x8": _bitmask(4, 8, like="HBAO bitmask 2x8"),

@@ -54,7 +54,7 @@ def test_a_count_left_out_is_the_default_of_the_technique() -> None:
 
 def test_options_go_to_every_technique_that_has_them() -> None:
     made = candidates(("statvo", "hbao", "ray_march"), 0.5, (2,), {"steps": 2, "denoise": 1, "quadrants": False})
-    assert [label for _, label, _ in made] == ["StatVO 2 layers", "HBAO 4x2", "ray march 16x2"]
+    assert [label for _, label, _ in made] == ["StatVO 2 layers", "HBAO 3x2", "ray march 16x2"]
     statvo, hbao, march = (module for *_, module in made)
     assert isinstance(statvo, StatVO)
     assert statvo.quadrants is False
