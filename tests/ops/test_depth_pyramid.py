@@ -39,7 +39,7 @@ def test_every_texel_is_the_pixel_of_the_oracle(size: tuple[int, int], share: fl
 def test_reads_stay_within_the_cap_in_texels_and_keep_their_place() -> None:
     pyramid = build_pyramid(random_mask(1, 200, 300, share=0.7), 8.0)
     column = torch.arange(1, 256)
-    at = texels_at(pyramid, torch.tensor(0), torch.tensor(0), column, column.float())
+    at = texels_at(pyramid, torch.zeros(1, dtype=torch.int64), torch.tensor(0), column, column.float())
     level = torch.bucketize(at, pyramid.start, right=True) - 1
     assert int(level.max()) == LEVELS - 1
     assert bool((column / 2**level <= 8).all())

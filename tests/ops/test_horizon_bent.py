@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
@@ -52,7 +51,7 @@ def test_directions_are_those_of_numerical_integration(form: dict, weighting: st
     obscurance, direction = bent(gb, **options)
     torch.testing.assert_close(obscurance, evaluate(gb, **options), atol=1e-12, rtol=0)
     arguments, settings = oracle_question(gb, **options)
-    mean = torch.from_numpy(oracle(*arguments, samples=3000, **settings))
+    mean = torch.from_numpy(oracle(*arguments, samples=2000, **settings))
     normal = torch.where(gb.valid, gb.normal, 0.0)
     open_share = (2 / 3 if weighting == "cosine" else 0.5) * normal - mean
     want = torch.nn.functional.normalize(open_share, dim=1)
@@ -61,7 +60,7 @@ def test_directions_are_those_of_numerical_integration(form: dict, weighting: st
     assert ((direction - normal).abs().amax(1)[kept] > 0.05).double().mean() > 0.3
     torch.testing.assert_close(
         direction.movedim(1, -1)[kept], want.movedim(1, -1)[kept], atol=4e-3, rtol=0
-    )  # 3,000 elevations a side, and the ends of arcs fall between them
+    )  # 2,000 elevations a side, and the ends of arcs fall between them
 
 
 def wedge(interior_deg: float) -> ts.GBuffer:
@@ -139,11 +138,12 @@ def test_pixels_without_an_open_direction_have_their_normal(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("orthographic", [False, True])
-@pytest.mark.parametrize("form", [FORMS[0], FORMS[3], FORMS[3] | {"max_radius_px": 0.6}], ids=str)
+@pytest.mark.parametrize("form", [FORMS[0], FORMS[3] | {"max_radius_px": 0.6}], ids=str)
 def test_gradcheck_with_texels_held(form: dict, orthographic: bool) -> None:
     gb = random_gbuffer(3, height=5, width=6, orthographic=orthographic)
     gb = ts.GBuffer(2.0 + 0.3 * (gb.depth - 2.0), gb.camera, normal=gb.normal, valid=gb.valid)
-    for weighting, number in itertools.product(WEIGHTINGS, (0, 2, 3, 4, 5, 6, 7)):
+    everything = [("cosine", number) for number in (0, 2, 3, 4, 5, 6, 7)]
+    for weighting, number in (*everything, ("uniform", 0), ("uniform", 2)):
         tensors, options = question(gb, footprint_step=0.0, weighting=weighting, **form)
         assert torch.autograd.gradcheck(
             lambda v, i=number, t=tensors, o=options: horizon_bent_normal(*t[:i], v, *t[i + 1 :], **o),

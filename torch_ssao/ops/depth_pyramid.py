@@ -56,16 +56,26 @@ def texels_at(pyramid: Pyramid, image: Tensor, row: Tensor, column: Tensor, dist
     """Texels that reads at whole pixels of the images take.
 
     Args:
-        image, row, column: int64 that broadcast, inside the images.
+        image, row, column: int64 that broadcast, inside the images; image has a dimension at least.
         distance: pixels from where the question is asked.
     Returns: int64 places in `Pyramid.pixel`.
     """
-    level = torch.zeros_like(distance, dtype=torch.int64)
+    level = torch.zeros_like(distance, dtype=torch.int32)
     for finer in range(LEVELS - 1):  # on a CPU faster than a search, and than a logarithm right on the bounds
         level += distance > pyramid.cap * 2**finer
     rows = ((pyramid.height - 1) >> level) + 1  # rounded up
     columns = ((pyramid.width - 1) >> level) + 1
-    return pyramid.start[level] + (image * rows + (row >> level)) * columns + (column >> level)
+    inside = (image * rows + (row.int() >> level)) * columns + (column.int() >> level)
+    return _picked(pyramid.start, level) + inside
+
+
+def pixels_of(pyramid: Pyramid, texels: Tensor) -> Tensor:
+    """Flat pixels of the batch that texels stand for, of the same shape."""
+    return _picked(pyramid.pixel, texels)
+
+
+def _picked(table: Tensor, places: Tensor) -> Tensor:
+    return table.index_select(0, places.flatten()).view(places.shape)  # on a CPU faster than indexing
 
 
 def _coarser(pixel: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torch_ssao.ops.depth_pyramid import Pyramid, furthest_read, texels_at
+from torch_ssao.ops.depth_pyramid import Pyramid, furthest_read, pixels_of, texels_at
 from torch_ssao.ops.sampling import GOLDEN
 
 SLOPE_LIMIT = 64.0  # a depth step of more pixel footprints than this a pixel is an edge, not a slope (89.1 degrees)
@@ -222,7 +222,7 @@ def find_texels(
         source = (pixels.image * height + row) * width + column
         return Texels(count, column, row, source, seen & valid.reshape(-1)[source])
     source = texels_at(pyramid, pixels.image, row, column, count)
-    pixel = pyramid.pixel[source]
+    pixel = pixels_of(pyramid, source)
     return Texels(count, pixel % width, pixel // width % height, source, seen & valid.reshape(-1)[pixel])
 
 

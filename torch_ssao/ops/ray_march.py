@@ -26,7 +26,7 @@ from torch import Tensor
 
 from torch_ssao import checks
 from torch_ssao.ops import ray_march_hit as hit
-from torch_ssao.ops.depth_pyramid import Pyramid, build_pyramid, texels_at
+from torch_ssao.ops.depth_pyramid import Pyramid, build_pyramid, pixels_of, texels_at
 from torch_ssao.ops.footprint import footprint_fade
 from torch_ssao.ops.plane_support import least_facing
 from torch_ssao.ops.ray_march_hit import Pixels, Steps
@@ -326,7 +326,7 @@ def _read(place: Tensor, inputs: _Inputs, block: _Block, spec: _Spec) -> Steps:
         own = torch.arange(inputs.reach.shape[1], device=x.device)[block.pixels]
         down, across = row - (own // spec.width + 0.5), column - (own % spec.width + 0.5)
         index = texels_at(inputs.pyramid, image, row_at, column_at, torch.maximum(down.abs(), across.abs()))
-        pixel = inputs.pyramid.pixel[index]
+        pixel = pixels_of(inputs.pyramid, index)
     known = inputs.valid.reshape(-1, inputs.valid.shape[2])[pixel]
     return Steps(seen, index, known)
 
