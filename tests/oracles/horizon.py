@@ -25,6 +25,8 @@ SMALL: Final = 0.05  # bounds on how much a slice's line approaches or recedes
 HORIZON: Final = 1e-3
 CONNECTED: Final = 3.0
 TRAPEZOID: Final = 6.0
+TRAPEZOID_THIN: Final = 24.0
+TRAPEZOID_STEP: Final = 0.25  # of the radius
 ROUNDINGS: Final = 4.0
 GRAZE: Final = 1e-3
 
@@ -161,12 +163,12 @@ def merged_length(intervals: list[tuple[float, float]]) -> float:
     return total
 
 
-def connected(tap: Tap, before: Tap | None, slope: float) -> bool:
+def connected(tap: Tap, before: Tap | None, slope: float, near: float = 0.0) -> bool:
     if not tap.seen or (before is not None and not before.seen):
         return False
     across = tap.along - (before.along if before else 0.0)
     rise = tap.towards - (before.towards if before else 0.0)
-    return across > 0 and abs(rise) <= slope * across
+    return across > 0 and abs(rise) <= max(slope * across, near)
 
 
 def side_increments(taps: list[Tap], plane: Slice, side: int, radius: float, s: Settings) -> float:
@@ -181,11 +183,9 @@ def side_increments(taps: list[Tap], plane: Slice, side: int, radius: float, s: 
                 if s.thickness is not None:
                     back = plane.elevation(tap.place + s.thickness * radius * tap.ray, side)
                     start = min(max(start, back), elevation)
-                mean = (
-                    0.5 * (earlier + weight)
-                    if connected(tap, taps[number - 1] if number else None, TRAPEZOID)
-                    else weight
-                )
+                slope = TRAPEZOID if s.thickness is None else TRAPEZOID_THIN
+                joined = connected(tap, taps[number - 1] if number else None, slope, TRAPEZOID_STEP * radius)
+                mean = 0.5 * (earlier + weight) if joined else weight
                 total += mean * (plane.share_below(elevation, side) - plane.share_below(start, side))
                 horizon = elevation
         earlier = weight

@@ -13,7 +13,9 @@ from torch_ssao.ops.horizon_taps import Frame, Taps
 ROUNDING = 4.0  # heights over the tangent plane below this many units of rounding of |x| are 0
 # Neighbouring taps are one surface up to this depth step per step across; found on six views of the built-in scenes, of 3, 6, 12.
 CONNECTED_SLOPE = 3.0  # to cover the arc between them
-TRAPEZOID_SLOPE = 6.0  # to average their attenuations
+TRAPEZOID_SLOPE = 6.0  # to average their attenuations, before infinitely thick occluders
+THIN_TRAPEZOID_SLOPE = 24.0  # the same of finite thickness; of 3, 6, 12, 24 on twelve views of the built-in scenes
+TRAPEZOID_STEP = 0.25  # of R: less is one surface at any slope, so that dense taps on surfaces seen at 80 degrees converge
 GRAZE = 1e-3  # of R: rounds off the corner where a ray touches the sphere, so that derivatives stay bounded
 
 
@@ -66,9 +68,9 @@ def weighted_increments(
     distance = torch.where(taps.seen, (taps.along**2 + taps.towards**2).sqrt(), taps.reach) / frame.radius
     weight = linear_attenuation(distance, falloff.expand_as(distance))
     earlier = torch.cat((torch.ones_like(weight[:, :, :1]), weight[:, :, :-1]), 2)
-    earlier = torch.where(
-        _connected(taps, TRAPEZOID_SLOPE), earlier, weight
-    )  # a step to another surface is not in between
+    near = TRAPEZOID_STEP * frame.radius
+    joined = _connected(taps, TRAPEZOID_SLOPE if thickness is None else THIN_TRAPEZOID_SLOPE, near)
+    earlier = torch.where(joined, earlier, weight)  # a step to another surface is not in between
     start = before
     if thickness is not None:
         ray = view_ray(frame, taps)
@@ -110,13 +112,17 @@ def covered_intervals(
     return _union(start, end).sum((0, 1))
 
 
-def _connected(taps: Taps, slope: float) -> Tensor:
-    """Whether each tap and the one before it (at first, the pixel itself) lie on one surface."""
+def _connected(taps: Taps, slope: float, near: Tensor | float = 0.0) -> Tensor:
+    """Whether each tap and the one before it (at first, the pixel itself) lie on one surface.
+
+    Args:
+        slope: most depth step per step across. near: (P,) depth step that is always small enough.
+    """
     zero, one = torch.zeros_like(taps.along[:, :, :1]), torch.ones_like(taps.seen[:, :, :1])
     across = taps.along - torch.cat((zero, taps.along[:, :, :-1]), 2)
     rise = taps.towards - torch.cat((zero, taps.towards[:, :, :-1]), 2)
     both = taps.seen & torch.cat((one, taps.seen[:, :, :-1]), 2)
-    return both & (across > 0) & (rise.abs() <= slope * across)
+    return both & (across > 0) & (rise.abs() <= (slope * across).clamp(min=near))
 
 
 def _links(measure: Measure, frame: Frame, taps: Taps, along: Tensor, towards: Tensor) -> tuple[Tensor, Tensor, Tensor]:
