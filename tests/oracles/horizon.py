@@ -24,6 +24,7 @@ WIDEST: Final = 0.9  # radius over distance up to which the image of the sphere 
 SMALL: Final = 0.05  # bounds on how much a slice's line approaches or recedes
 HORIZON: Final = 1e-3
 CONNECTED: Final = 3.0
+LINK_STEP: Final = 0.25  # of the radius
 TRAPEZOID: Final = 6.0
 TRAPEZOID_THIN: Final = 24.0
 TRAPEZOID_STEP: Final = 0.25  # of the radius
@@ -168,7 +169,8 @@ def connected(tap: Tap, before: Tap | None, slope: float, near: float = 0.0) -> 
         return False
     across = tap.along - (before.along if before else 0.0)
     rise = tap.towards - (before.towards if before else 0.0)
-    return across > 0 and abs(rise) <= max(slope * across, near)
+    small = max(abs(across), abs(rise)) <= near and across != 0
+    return small or (across > 0 and abs(rise) <= slope * across)
 
 
 def side_increments(taps: list[Tap], plane: Slice, side: int, radius: float, s: Settings) -> float:
@@ -203,7 +205,7 @@ def side_union(taps: list[Tap], plane: Slice, side: int, radius: float, s: Setti
             ends = [plane.elevation(tap.place + t * tap.ray, side) for t in part]
             arcs.append((ends[1], ends[0]))
         before = taps[number - 1] if number else None
-        if s.connected and connected(tap, before, CONNECTED):
+        if s.connected and connected(tap, before, CONNECTED, min(thick, LINK_STEP * radius)):
             start = plane.point if before is None else before.place
             length = float(np.linalg.norm(tap.place - start))
             ray = (tap.place - start) / length

@@ -13,9 +13,13 @@ from torch_ssao.ops.horizon_taps import Frame, Taps
 ROUNDING = 4.0  # heights over the tangent plane below this many units of rounding of |x| are 0
 # Neighbouring taps are one surface up to this depth step per step across; found on six views of the built-in scenes, of 3, 6, 12.
 CONNECTED_SLOPE = 3.0  # to cover the arc between them
+LINK_STEP = (
+    0.25  # of R, and at most the thickness: less is one surface at any slope, so that dense taps on surfaces seen
+)
+# at 80 degrees, or from below, converge; of 0.1, 0.25, 0.5 on analytic scenes
 TRAPEZOID_SLOPE = 6.0  # to average their attenuations, before infinitely thick occluders
 THIN_TRAPEZOID_SLOPE = 24.0  # the same of finite thickness; of 3, 6, 12, 24 on twelve views of the built-in scenes
-TRAPEZOID_STEP = 0.25  # of R: less is one surface at any slope, so that dense taps on surfaces seen at 80 degrees converge
+TRAPEZOID_STEP = 0.25  # as LINK_STEP
 GRAZE = 1e-3  # of R: rounds off the corner where a ray touches the sphere, so that derivatives stay bounded
 
 
@@ -102,7 +106,7 @@ def covered_intervals(
     lows, highs, hits = [low], [high], [hit]
     if connected:
         lows, highs, hits = (
-            [*a, b] for a, b in zip((lows, highs, hits), _links(measure, frame, taps, along, towards), strict=True)
+            [*a, b] for a, b in zip((lows, highs, hits), _links(measure, frame, taps, thickness), strict=True)
         )
     low, high, hit = (torch.cat(parts, 2) for parts in (lows, highs, hits))
     high = torch.maximum(high, bias)
@@ -116,20 +120,24 @@ def _connected(taps: Taps, slope: float, near: Tensor | float = 0.0) -> Tensor:
     """Whether each tap and the one before it (at first, the pixel itself) lie on one surface.
 
     Args:
-        slope: most depth step per step across. near: (P,) depth step that is always small enough.
+        slope: most depth step per step outwards. near: (P,) step, either way, that is small enough at any slope.
     """
     zero, one = torch.zeros_like(taps.along[:, :, :1]), torch.ones_like(taps.seen[:, :, :1])
     across = taps.along - torch.cat((zero, taps.along[:, :, :-1]), 2)
     rise = taps.towards - torch.cat((zero, taps.towards[:, :, :-1]), 2)
     both = taps.seen & torch.cat((one, taps.seen[:, :, :-1]), 2)
-    return both & (across > 0) & (rise.abs() <= (slope * across).clamp(min=near))
+    # Under an overhang, steps along the image come back towards the pixel: a step either way is small enough.
+    small = (rise.abs() <= near) & (across.abs() <= near) & (across != 0)
+    return both & (((across > 0) & (rise.abs() <= slope * across)) | small)
 
 
-def _links(measure: Measure, frame: Frame, taps: Taps, along: Tensor, towards: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _links(measure: Measure, frame: Frame, taps: Taps, thickness: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Arcs between neighbouring taps of one surface, clipped to the sphere; the first neighbour is the pixel itself."""
+    along, towards = (torch.where(taps.seen, part, taps.reach) for part in (taps.along, taps.towards))
+    near = LINK_STEP * frame.radius if thickness is None else thickness.clamp(max=LINK_STEP) * frame.radius
     zero = torch.zeros_like(along[:, :, :1])
     from_along, from_towards = torch.cat((zero, along[:, :, :-1]), 2), torch.cat((zero, towards[:, :, :-1]), 2)
-    same = _connected(taps, CONNECTED_SLOPE)
+    same = _connected(taps, CONNECTED_SLOPE, near.detach())
     across, rise = torch.where(same, along - from_along, 1.0), torch.where(same, towards - from_towards, 0.0)
     length = (across**2 + rise**2).sqrt()
     across, rise = across / length, rise / length
