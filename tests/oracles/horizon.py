@@ -164,13 +164,14 @@ def merged_length(intervals: list[tuple[float, float]]) -> float:
     return total
 
 
-def connected(tap: Tap, before: Tap | None, slope: float, near: float = 0.0) -> bool:
+def connected(tap: Tap, before: Tap | None, slope: float, near: float, back: bool = False) -> bool:
     if not tap.seen or (before is not None and not before.seen):
         return False
     across = tap.along - (before.along if before else 0.0)
     rise = tap.towards - (before.towards if before else 0.0)
-    small = max(abs(across), abs(rise)) <= near and across != 0
-    return small or (across > 0 and abs(rise) <= slope * across)
+    if across < 0:
+        return back and max(-across, abs(rise)) <= near
+    return across > 0 and abs(rise) <= max(slope * across, near)
 
 
 def side_increments(taps: list[Tap], plane: Slice, side: int, radius: float, s: Settings) -> float:
@@ -205,7 +206,7 @@ def side_union(taps: list[Tap], plane: Slice, side: int, radius: float, s: Setti
             ends = [plane.elevation(tap.place + t * tap.ray, side) for t in part]
             arcs.append((ends[1], ends[0]))
         before = taps[number - 1] if number else None
-        if s.connected and connected(tap, before, CONNECTED, min(thick, LINK_STEP * radius)):
+        if s.connected and connected(tap, before, CONNECTED, min(thick, LINK_STEP * radius), back=True):
             start = plane.point if before is None else before.place
             length = float(np.linalg.norm(tap.place - start))
             ray = (tap.place - start) / length

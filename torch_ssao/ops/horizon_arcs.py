@@ -116,19 +116,21 @@ def covered_intervals(
     return _union(start, end).sum((0, 1))
 
 
-def _connected(taps: Taps, slope: float, near: Tensor | float = 0.0) -> Tensor:
+def _connected(taps: Taps, slope: float, near: Tensor, *, back: bool = False) -> Tensor:
     """Whether each tap and the one before it (at first, the pixel itself) lie on one surface.
 
     Args:
-        slope: most depth step per step outwards. near: (P,) step, either way, that is small enough at any slope.
+        slope: most depth step per step outwards. near: (P,) depth step that is small enough at any slope.
+        back: so is a step back towards the pixel, as under an overhang.
     """
     zero, one = torch.zeros_like(taps.along[:, :, :1]), torch.ones_like(taps.seen[:, :, :1])
     across = taps.along - torch.cat((zero, taps.along[:, :, :-1]), 2)
-    rise = taps.towards - torch.cat((zero, taps.towards[:, :, :-1]), 2)
+    rise = (taps.towards - torch.cat((zero, taps.towards[:, :, :-1]), 2)).abs()
     both = taps.seen & torch.cat((one, taps.seen[:, :, :-1]), 2)
-    # Under an overhang, steps along the image come back towards the pixel: a step either way is small enough.
-    small = (rise.abs() <= near) & (across.abs() <= near) & (across != 0)
-    return both & (((across > 0) & (rise.abs() <= slope * across)) | small)
+    joined = (across > 0) & ((rise <= slope * across) | (rise <= near))
+    if back:
+        joined = joined | ((across < 0) & (-across <= near) & (rise <= near))
+    return both & joined
 
 
 def _links(measure: Measure, frame: Frame, taps: Taps, thickness: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -137,7 +139,7 @@ def _links(measure: Measure, frame: Frame, taps: Taps, thickness: Tensor | None)
     near = LINK_STEP * frame.radius if thickness is None else thickness.clamp(max=LINK_STEP) * frame.radius
     zero = torch.zeros_like(along[:, :, :1])
     from_along, from_towards = torch.cat((zero, along[:, :, :-1]), 2), torch.cat((zero, towards[:, :, :-1]), 2)
-    same = _connected(taps, CONNECTED_SLOPE, near.detach())
+    same = _connected(taps, CONNECTED_SLOPE, near, back=True)
     across, rise = torch.where(same, along - from_along, 1.0), torch.where(same, towards - from_towards, 0.0)
     length = (across**2 + rise**2).sqrt()
     across, rise = across / length, rise / length
