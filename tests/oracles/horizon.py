@@ -27,7 +27,10 @@ WIDEST: Final = 0.9  # radius over distance up to which the image of the sphere 
 SMALL: Final = 0.05  # bounds on how much a slice's line approaches or recedes
 HORIZON: Final = 1e-3
 CONNECTED: Final = 3.0
+LINK_STEP: Final = 0.25  # of the radius
 TRAPEZOID: Final = 6.0
+TRAPEZOID_THIN: Final = 24.0
+TRAPEZOID_STEP: Final = 0.25  # of the radius
 ROUNDINGS: Final = 4.0
 GRAZE: Final = 1e-3
 
@@ -164,12 +167,14 @@ def merged_length(intervals: list[tuple[float, float]]) -> float:
     return total
 
 
-def connected(tap: Tap, before: Tap | None, slope: float) -> bool:
+def connected(tap: Tap, before: Tap | None, slope: float, near: float, back: bool = False) -> bool:
     if not tap.seen or (before is not None and not before.seen):
         return False
     across = tap.along - (before.along if before else 0.0)
     rise = tap.towards - (before.towards if before else 0.0)
-    return across > 0 and abs(rise) <= slope * across
+    if across < 0:
+        return back and max(-across, abs(rise)) <= near
+    return across > 0 and abs(rise) <= max(slope * across, near)
 
 
 Arcs = list[tuple[float, float, float]]  # weight, lower and upper elevation
@@ -188,12 +193,9 @@ def side_rises(taps: list[Tap], plane: Slice, side: int, radius: float, s: Setti
                 if s.thickness is not None:
                     back = plane.elevation(tap.place + s.thickness * radius * tap.ray, side)
                     start = min(max(start, back), elevation)
-                mean = (
-                    0.5 * (earlier + weight)
-                    if connected(tap, taps[number - 1] if number else None, TRAPEZOID)
-                    else weight
-                )
-                arcs.append((mean, start, elevation))
+                slope = TRAPEZOID if s.thickness is None else TRAPEZOID_THIN
+                joined = connected(tap, taps[number - 1] if number else None, slope, TRAPEZOID_STEP * radius)
+                arcs.append((0.5 * (earlier + weight) if joined else weight, start, elevation))
                 horizon = elevation
         earlier = weight
     return arcs
@@ -221,7 +223,7 @@ def side_covered(taps: list[Tap], plane: Slice, side: int, radius: float, s: Set
             ends = [plane.elevation(tap.place + t * tap.ray, side) for t in part]
             arcs.append((ends[1], ends[0]))
         before = taps[number - 1] if number else None
-        if s.connected and connected(tap, before, CONNECTED):
+        if s.connected and connected(tap, before, CONNECTED, min(thick, LINK_STEP * radius), back=True):
             start = plane.point if before is None else before.place
             length = float(np.linalg.norm(tap.place - start))
             ray = (tap.place - start) / length

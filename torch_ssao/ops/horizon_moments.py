@@ -52,49 +52,7 @@ def occluded_moments(
         falloff (of "increments"), thickness (of the radius; None: infinite), bias (radians): (P,).
     """
     if estimator == "increments":
-        weight, low, high = _rises(measure, frame, taps, falloff, thickness, bias)
+        weight, low, high = arcs.rises(measure, frame, taps, falloff, thickness, bias)
         return (weight * (moments(measure, high) - moments(measure, low))).sum(3)
-    low, high = _united(measure, frame, taps, thickness, bias, connected=connected)
+    low, high = arcs.disjoint_arcs(measure, frame, taps, thickness, bias, connected=connected)
     return (moments(measure, high) - moments(measure, low)).sum(3)
-
-
-def _rises(
-    measure: Measure, frame: Frame, taps: Taps, falloff: Tensor, thickness: Tensor | None, bias: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights and elevations of the arcs by which each tap raises the horizon; see `arcs.weighted_increments`."""
-    front = torch.where(taps.seen, measure.elevation(taps.along, taps.towards), bias)
-    horizon = torch.maximum(front, bias).cummax(2).values
-    before = torch.cat((bias.expand_as(front[:, :, :1]), horizon[:, :, :-1]), 2)
-    distance = torch.where(taps.seen, (taps.along**2 + taps.towards**2).sqrt(), taps.reach) / frame.radius
-    weight = arcs.linear_attenuation(distance, falloff.expand_as(distance))
-    earlier = torch.cat((torch.ones_like(weight[:, :, :1]), weight[:, :, :-1]), 2)
-    earlier = torch.where(arcs._connected(taps, arcs.TRAPEZOID_SLOPE), earlier, weight)
-    start = before
-    if thickness is not None:
-        ray, depth = arcs.view_ray(frame, taps), thickness * frame.radius
-        back = measure.elevation(taps.along + depth * ray[0], taps.towards + depth * ray[1])
-        start = torch.minimum(torch.maximum(before, back), horizon)
-    return 0.5 * (earlier + weight), start, horizon
-
-
-def _united(
-    measure: Measure, frame: Frame, taps: Taps, thickness: Tensor | None, bias: Tensor, *, connected: bool
-) -> tuple[Tensor, Tensor]:
-    """Elevations of disjoint arcs with the union that the taps' occluders cover; see `arcs.covered_intervals`."""
-    along, towards = (torch.where(taps.seen, part, taps.reach) for part in (taps.along, taps.towards))
-    ray = arcs.view_ray(frame, taps)
-    depth = torch.full_like(frame.radius, torch.inf) if thickness is None else thickness * frame.radius
-    first, last, hit = arcs._clip(along, towards, ray[0], ray[1], frame.radius, depth)
-    high = measure.elevation(along + first * ray[0], towards + first * ray[1])
-    low = measure.elevation(along + last * ray[0], towards + last * ray[1])
-    hit = hit & taps.seen
-    if connected:
-        low_link, high_link, hit_link = arcs._links(measure, frame, taps, along, towards)
-        low, high = torch.cat((low, low_link), 2), torch.cat((high, high_link), 2)
-        hit = torch.cat((hit, hit_link), 2)
-    high = torch.where(hit, torch.maximum(high, bias), bias)
-    low = torch.minimum(torch.where(hit, torch.maximum(low, bias), bias), high)
-    low, order = low.sort(2)
-    high = high.gather(2, order)
-    reached = torch.cat((low[:, :, :1], high.cummax(2).values[:, :, :-1]), 2)
-    return torch.maximum(low, torch.minimum(reached, high)), high

@@ -65,10 +65,9 @@ def ray_march_visibility(
         intrinsics: (B, 4) fx, fy, cx, cy in pixels.
         disk: (K, 2) points inside the unit disk, one a ray, one a ring of equal area: the mean does not depend on K.
         rotation, offset: (H, W) noise in [0, 1): turns of the disk, and places of the points within their rings.
-        steps: steps a ray, >= 1.
+        steps: a ray, >= 1.
         orthographic: parallel projection along +z.
-        gradient: "exact", "surrogate" or "soft", see the module.
-        surrogate_width: width of the sigmoid, of the reach, > 0.
+        gradient, surrogate_width: see the module; the width is of the reach, > 0.
         max_radius_px: steps further than this many pixels away read a pyramid of selected pixels (`ops.depth_pyramid`); the
             caller shortens the reach to `furthest_read`. None: no cap.
     Returns: (B, H, W) in [0, 1]; 1 at invalid pixels, and it fades to 1 where the reach spans less than a pixel.
@@ -95,8 +94,8 @@ def ray_march_visibility(
         valid.flatten(2).transpose(1, 2),
         intrinsics.detach(),
     )
-    fade = footprint_fade(points[:, 2, 0], valid[:, 0], reach, intrinsics[:, :2], orthographic=orthographic).flatten(1)
-    return (visibility + (1 - fade) * (1 - visibility)).unflatten(1, (height, width))
+    fade = footprint_fade(points[:, 2, 0], valid[:, 0], reach, intrinsics[:, :2], orthographic=orthographic)
+    return torch.lerp(torch.ones_like(fade), visibility.unflatten(1, (height, width)), fade)
 
 
 def tangent_planes(points: Tensor, normal: Tensor, valid: Tensor, intrinsics: Tensor, *, orthographic: bool) -> Tensor:

@@ -1,0 +1,71 @@
+"""The ray march in the limit of many rays and steps, on scenes of all kinds, and the derivative of its mean to the radius."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import torch_ssao as ts
+from support.clutter import clutter
+from support.limits import ANGLES, EXPONENTS, KINDS, SCENES, LimitCase
+
+FAST = [
+    ("dihedral 60", 70.0, "10"),
+    ("room corner", 45.0, "50"),
+    ("finite wall", 70.0, "orthographic"),
+    ("cylinder", 80.0, "50"),
+    ("trench", 45.0, "10"),
+]
+
+
+def check(case: LimitCase) -> None:
+    """At single pixels."""
+    for falloff in EXPONENTS if case.pixels else ():
+        error = case.marched(falloff)
+        assert error.abs().max() <= 0.005, (falloff, error)
+
+
+@pytest.mark.parametrize(("name", "angle", "kind"), FAST)
+def test_many_rays_reach_the_closed_forms(name: str, angle: float, kind: str) -> None:
+    case = LimitCase.of(name, angle, kind, count=3)
+    assert case.pixels
+    check(case)
+
+
+def test_many_rays_under_a_ceiling() -> None:
+    check(LimitCase.between_plates(count=3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", SCENES)
+def test_many_rays_reach_the_closed_forms_in_every_view(name: str, kind: str) -> None:
+    for angle in ANGLES:
+        check(LimitCase.of(name, angle, kind, size=768 if kind == "120" else 384))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param(
+            {"gradient": gradient},
+            marks=pytest.mark.xfail(
+                strict=True, reason=f"{gradient}: a longer ray hits other things; hits are held, or seen only nearby"
+            ),
+        )
+        for gradient in ("exact", "surrogate")
+    ],
+    ids=str,
+)
+def test_radius_gradient_is_that_of_the_expected_estimate(options: dict) -> None:
+    gb, step, frames = clutter(48, 64).to(torch.float64), 0.05, 6
+    net = ts.RayMarchedSSAO(0.6, rays=8, steps=8, learnable=("radius",), **options).double()
+    slope = sum(float(torch.autograd.grad(net(gb, frame=f).mean(), net.raw_radius)[0]) for f in range(frames)) / float(
+        torch.autograd.grad(net.radius, net.raw_radius)[0]
+    )
+    ends = [ts.RayMarchedSSAO(0.6 * (1 + sign * step), rays=8, steps=8).double() for sign in (1, -1)]
+    with torch.no_grad():
+        differences = sum(float(ends[0](gb, frame=f).mean() - ends[1](gb, frame=f).mean()) for f in range(frames))
+    differences /= 2 * step * 0.6
+    assert abs(differences) / frames > 0.02
+    assert slope == pytest.approx(differences, rel=0.02)
