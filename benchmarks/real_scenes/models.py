@@ -55,7 +55,7 @@ def _bitmask(
 ) -> Model:
     return Model(
         lambda radius: ts.HBAO(radius, slices=slices, steps=steps, connected=connected, offscreen=offscreen, denoise=1),
-        *(BITMASK, 120, like),
+        *(BITMASK, 90, like),
         taps=2 * slices * steps,
     )
 
@@ -65,7 +65,7 @@ def _increments(slices: int, steps: int, like: str | None = None) -> Model:
         lambda radius: ts.HBAO(
             radius, estimator="increments", slices=slices, steps=steps, offscreen="extend", denoise=1
         ),
-        *(INCREMENTS, 160, like),
+        *(INCREMENTS, 120, like),
         taps=2 * slices * steps,
     )
 
@@ -85,7 +85,7 @@ def _classic(slices: int, steps: int) -> Model:
             denoise=1,
         ),
         ("radius", "falloff", "bias_deg", "contrast"),
-        160,
+        120,
         taps=2 * slices * steps,
     )
 
@@ -93,7 +93,7 @@ def _classic(slices: int, steps: int) -> Model:
 def _rays(rays: int, steps: int, like: str | None = None) -> Model:
     return Model(
         lambda radius: ts.RayMarchedSSAO(radius, rays=rays, steps=steps, thickness=0.4, falloff=8.0, denoise=1),
-        *(("radius", "thickness", "contrast"), 120, like),
+        *(("radius", "thickness", "contrast"), 90, like),
         taps=rays * steps,
     )
 
@@ -103,14 +103,14 @@ def _xegtao(preset: str, *, tuned: bool) -> Model:
     return Model(
         lambda radius: XeGTAO(radius, slices=slices, steps=steps, thin_occluder=0.1 if tuned else 0.0, denoise=1),
         XEGTAO if tuned else (),
-        200,
+        160,
         full_size=True,
         taps=2 * slices * steps,
     )
 
 
 TECHNIQUES = {
-    "StatVO 4 layers": Model(_statvo()),
+    "StatVO 4 layers": Model(_statvo(), None, 150),
     "HBAO bitmask 3x3, connected": _bitmask(3, 3, connected=True),
     "HBAO bitmask 3x6, connected": _bitmask(3, 6, connected=True),
     "HBAO bitmask 2x8": _bitmask(2, 8),

@@ -86,7 +86,7 @@ class HorizonPixels:
         self.slices = given["slices"]
         layout = taps.Layout(self.slices, given["steps"], given["step_power"], camera.is_orthographic, None, False)
         cosine, connected = given["weighting"] == "cosine", given["connected"]
-        self.kernel = horizon._Horizon(layout, cosine, given["estimator"], connected, *noise, 0.0)
+        self.kernel = horizon._Horizon(layout, cosine, given["estimator"], connected, *noise, 0.0, bent=False)
         self.inputs = horizon._Inputs.of([planes, valid, gb.normal, intrinsics, *numbers])
 
     def visibility(self, start: int, stop: int | None = None) -> Tensor:
