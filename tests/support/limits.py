@@ -87,13 +87,13 @@ class HorizonPixels:
         layout = taps.Layout(self.slices, given["steps"], given["step_power"], camera.is_orthographic, None, False)
         cosine, connected = given["weighting"] == "cosine", given["connected"]
         self.kernel = horizon._Horizon(layout, cosine, given["estimator"], connected, *noise, 0.0, bent=False)
-        self.inputs = horizon._Inputs.of([planes, valid, gb.normal, intrinsics, *numbers])
+        self.inputs = horizon._Inputs.of([planes, valid, gb.normal, intrinsics, *numbers], None)
 
     def visibility(self, start: int, stop: int | None = None) -> Tensor:
         """Of the flat pixels from `start` to `stop`, by default of one."""
         block = horizon._Block(self.kernel, self.inputs, start, stop or start + 1, range(self.slices))
         with torch.no_grad():
-            return 1.0 - block.function(*block.leaves)[0].clamp(0, 1)
+            return 1.0 - block.function(*block.leaves)[0][0].clamp(0, 1)
 
 
 class MarchedPixels:
@@ -114,22 +114,24 @@ class MarchedPixels:
         noise = tiled_noise(camera.height, camera.width, 0, dtype=torch.float64, device=gb.depth.device)
         spec = ray_march._Spec(steps, camera.height, camera.width, camera.is_orthographic, "exact", 0.05)
         self.kernel = ray_march._March(spec, poisson_disk(rays, dtype=torch.float64), *(n.reshape(-1) for n in noise))
-        planes = ray_march.tangent_planes(points, normals, orthographic=camera.is_orthographic)
+        intrinsics = torch.stack((camera.fx, camera.fy, camera.cx, camera.cy), 1).double()
+        options = {"orthographic": camera.is_orthographic}
+        planes = ray_march.tangent_planes(points, normals, gb.valid_mask, intrinsics, **options).flatten(2, 3)
         self.inputs = ray_march._Inputs(
             points[:, :, 0].flatten(2),
             normals[:, :, 0].flatten(2),
             torch.full((1, camera.height * camera.width), radius, dtype=torch.float64),
             torch.tensor([falloff], dtype=torch.float64),
             None if thickness is None else torch.tensor([thickness], dtype=torch.float64),
-            planes.flatten(2, 3).transpose(1, 2).contiguous(),
+            planes.transpose(1, 2).contiguous(),
             gb.valid_mask.flatten(2).transpose(1, 2),
-            torch.stack((camera.fx, camera.fy, camera.cx, camera.cy), 1).double(),
+            intrinsics,
         )
 
     def visibility(self, pixel: int) -> Tensor:
         """(1,) of a flat pixel; NaN where steps leave the image, even behind a hit: the rest weighs more there."""
         block = ray_march._Block(slice(0, len(self.kernel.disk)), slice(0, 1), slice(pixel, pixel + 1))
-        piece = ray_march._Piece(self.kernel, block, self.inputs)
+        piece = ray_march._Piece(self.kernel, block, self.inputs, self.inputs.planes)
         weight = piece.weight.sum(0)[0]
         whole = weight > len(self.kernel.disk) - 0.5 / self.kernel.spec.steps
         return torch.where(whole, piece.visibility(*piece.leaves)[0][0] / weight, torch.nan)
