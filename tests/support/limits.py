@@ -50,7 +50,7 @@ ANGLES = (0.0, 20.0, 45.0, 70.0, 80.0)
 
 # Options of `HorizonPixels`, and the closed form: falloff, weighting.
 HORIZON_FORMS: dict[str, tuple[dict[str, Any], str, str]] = {
-    "increments, binary": ({"estimator": "increments", "falloff": 200.0}, "binary", "cosine"),
+    "increments, binary": ({"estimator": "increments", "falloff": 1e4}, "binary", "cosine"),
     "increments, linear": ({"estimator": "increments", "falloff": 1.0}, "linear", "cosine"),
     "increments, quadratic": ({"estimator": "increments", "falloff": 2.0}, "quadratic", "cosine"),
     "bitmask, connected": ({}, "binary", "cosine"),
