@@ -222,6 +222,8 @@ class LimitCase:
         build, radius, span = SCENES[name]
         scene = build()
         camera = scene.camera(size, size, view_angle_deg=angle, span=span, **KINDS[kind])
+        if camera.is_orthographic:  # it sees less where its rectangle of rays would reach through a wall
+            radius = min(radius, 0.3 * size / float(camera.fy))
         return LimitCase(scene, camera, radius, count=count)
 
     @staticmethod
