@@ -26,7 +26,6 @@ HORIZON: Final = 1e-3
 CONNECTED: Final = 3.0
 LINK_STEP: Final = 0.25  # of the radius
 TRAPEZOID: Final = 6.0
-TRAPEZOID_THIN: Final = 24.0
 TRAPEZOID_STEP: Final = 0.25  # of the radius
 ROUNDINGS: Final = 4.0
 GRAZE: Final = 1e-3
@@ -186,8 +185,7 @@ def side_increments(taps: list[Tap], plane: Slice, side: int, radius: float, s: 
                 if s.thickness is not None:
                     back = plane.elevation(tap.place + s.thickness * radius * tap.ray, side)
                     start = min(max(start, back), elevation)
-                slope = TRAPEZOID if s.thickness is None else TRAPEZOID_THIN
-                joined = connected(tap, taps[number - 1] if number else None, slope, TRAPEZOID_STEP * radius)
+                joined = connected(tap, taps[number - 1] if number else None, TRAPEZOID, TRAPEZOID_STEP * radius)
                 mean = 0.5 * (earlier + weight) if joined else weight
                 total += mean * (plane.share_below(elevation, side) - plane.share_below(start, side))
                 horizon = elevation
