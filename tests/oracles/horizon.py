@@ -29,7 +29,6 @@ HORIZON: Final = 1e-3
 CONNECTED: Final = 3.0
 LINK_STEP: Final = 0.25  # of the radius
 TRAPEZOID: Final = 6.0
-TRAPEZOID_THIN: Final = 24.0
 TRAPEZOID_STEP: Final = 0.25  # of the radius
 ROUNDINGS: Final = 4.0
 GRAZE: Final = 1e-3
@@ -193,8 +192,7 @@ def side_rises(taps: list[Tap], plane: Slice, side: int, radius: float, s: Setti
                 if s.thickness is not None:
                     back = plane.elevation(tap.place + s.thickness * radius * tap.ray, side)
                     start = min(max(start, back), elevation)
-                slope = TRAPEZOID if s.thickness is None else TRAPEZOID_THIN
-                joined = connected(tap, taps[number - 1] if number else None, slope, TRAPEZOID_STEP * radius)
+                joined = connected(tap, taps[number - 1] if number else None, TRAPEZOID, TRAPEZOID_STEP * radius)
                 arcs.append((0.5 * (earlier + weight) if joined else weight, start, elevation))
                 horizon = elevation
         earlier = weight

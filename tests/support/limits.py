@@ -50,7 +50,7 @@ ANGLES = (0.0, 20.0, 45.0, 70.0, 80.0)
 
 # Options of `HorizonPixels`, and the closed form: falloff, weighting.
 HORIZON_FORMS: dict[str, tuple[dict[str, Any], str, str]] = {
-    "increments, binary": ({"estimator": "increments", "falloff": 200.0}, "binary", "cosine"),
+    "increments, binary": ({"estimator": "increments", "falloff": 1e4}, "binary", "cosine"),
     "increments, linear": ({"estimator": "increments", "falloff": 1.0}, "linear", "cosine"),
     "increments, quadratic": ({"estimator": "increments", "falloff": 2.0}, "quadratic", "cosine"),
     "bitmask, connected": ({}, "binary", "cosine"),
@@ -224,6 +224,8 @@ class LimitCase:
         build, radius, span = SCENES[name]
         scene = build()
         camera = scene.camera(size, size, view_angle_deg=angle, span=span, **KINDS[kind])
+        if camera.is_orthographic:  # it sees less where its rectangle of rays would reach through a wall
+            radius = min(radius, 0.3 * size / float(camera.fy))
         return LimitCase(scene, camera, radius, count=count)
 
     @staticmethod

@@ -16,8 +16,7 @@ CONNECTED_SLOPE = 3.0  # to cover the arc between them
 # Depth steps below this share of R, and at most the thickness, are one surface at any slope, so that dense taps on surfaces seen
 # at 80 degrees, or from below, converge; of 0.1, 0.25, 0.5 on analytic scenes.
 LINK_STEP = 0.25
-TRAPEZOID_SLOPE = 6.0  # to average their attenuations, before infinitely thick occluders
-THIN_TRAPEZOID_SLOPE = 24.0  # the same of finite thickness; of 3, 6, 12, 24 on twelve views of the built-in scenes
+TRAPEZOID_SLOPE = 6.0  # to average their attenuations; 12 and 24 put halos on walls two radii behind a pillar
 TRAPEZOID_STEP = 0.25  # as LINK_STEP
 GRAZE = 1e-3  # of R: rounds off the corner where a ray touches the sphere, so that derivatives stay bounded
 
@@ -81,8 +80,7 @@ def rises(
     distance = torch.where(taps.seen, (taps.along**2 + taps.towards**2).sqrt(), taps.reach) / frame.radius
     weight = linear_attenuation(distance, falloff.expand_as(distance))
     earlier = torch.cat((torch.ones_like(weight[:, :, :1]), weight[:, :, :-1]), 2)
-    near = TRAPEZOID_STEP * frame.radius
-    joined = _connected(taps, TRAPEZOID_SLOPE if thickness is None else THIN_TRAPEZOID_SLOPE, near)
+    joined = _connected(taps, TRAPEZOID_SLOPE, TRAPEZOID_STEP * frame.radius)
     earlier = torch.where(joined, earlier, weight)  # a step to another surface is not in between
     start = before
     if thickness is not None:
