@@ -98,12 +98,12 @@ def _rays(rays: int, steps: int, like: str | None = None) -> Model:
     )
 
 
-def _xegtao(preset: str, *, tuned: bool) -> Model:
+def _xegtao(preset: str, parameters: tuple[str, ...] = (), like: str | None = None) -> Model:
     slices, steps = PRESETS[preset]
+    thin = 0.1 if parameters else 0.0
     return Model(
-        lambda radius: XeGTAO(radius, slices=slices, steps=steps, thin_occluder=0.1 if tuned else 0.0, denoise=1),
-        XEGTAO if tuned else (),
-        160,
+        lambda radius: XeGTAO(radius, slices=slices, steps=steps, thin_occluder=thin, denoise=1),
+        *(parameters, 160, like),
         full_size=True,
         taps=2 * slices * steps,
     )
@@ -114,22 +114,21 @@ TECHNIQUES = {
     "HBAO bitmask 3x3, connected": _bitmask(3, 3, connected=True),
     "HBAO bitmask 3x6, connected": _bitmask(3, 6, connected=True),
     "HBAO bitmask 2x8": _bitmask(2, 8),
-    "HBAO bitmask 2x8, connected": _bitmask(2, 8, connected=True, like="HBAO bitmask 3x6, connected"),
     "HBAO bitmask 2x8, open border": _bitmask(2, 8, offscreen="open", like="HBAO bitmask 2x8"),
-    "HBAO bitmask 4x4": _bitmask(4, 4, like="HBAO bitmask 2x8"),
+    "HBAO bitmask 4x4, connected": _bitmask(4, 4, connected=True, like="HBAO bitmask 3x6, connected"),
     "HBAO bitmask 4x8": _bitmask(4, 8, like="HBAO bitmask 2x8"),
     "HBAO bitmask 2x16": _bitmask(2, 16, like="HBAO bitmask 2x8"),
     "HBAO bitmask 8x16": _bitmask(8, 16, like="HBAO bitmask 2x8"),
-    "HBAO increments 3x3": _increments(3, 3),
-    "HBAO increments 2x8": _increments(2, 8),
-    "HBAO increments 4x8": _increments(4, 8, like="HBAO increments 2x8"),
+    "HBAO increments 3x6": _increments(3, 6),
+    "HBAO increments 3x3": _increments(3, 3, like="HBAO increments 3x6"),
+    "HBAO increments 4x8": _increments(4, 8, like="HBAO increments 3x6"),
     "HBAO classic 4x4": _classic(4, 4),
     "ray march 16x8": _rays(16, 8),
     "ray march 8x8": _rays(8, 8, like="ray march 16x8"),
     "ray march 32x16": _rays(32, 16, like="ray march 16x8"),
-    "XeGTAO High, shipped": _xegtao("high", tuned=False),
-    "XeGTAO High, tuned": _xegtao("high", tuned=True),
-    "XeGTAO Ultra, tuned": _xegtao("ultra", tuned=True),
+    "XeGTAO High, shipped": _xegtao("high"),
+    "XeGTAO High, tuned": _xegtao("high", XEGTAO),
+    "XeGTAO Ultra, tuned": _xegtao("ultra", XEGTAO, like="XeGTAO High, tuned"),
 }
 
 GROUPS = {"statvo": STATVO, "techniques": TECHNIQUES}

@@ -144,7 +144,7 @@ def is_inside(image: Image, place: Floats, pixel: tuple[int, int], slack: float,
 
 
 def ray_visibility(image: Image, start: Floats, direction: Floats, reach: float) -> tuple[float, float]:
-    """Contribution of one ray, and the share of its steps that fall in the image."""
+    """Contribution of one ray, and its weight: 1 with a hit, else the share of its steps that fall in the image."""
     slack = ROUNDING_EPSILONS * image.eps * (float(np.linalg.norm(start)) + reach)
     thickness = math.inf if image.thickness is None else image.thickness * reach
     places = [start + (j / image.steps) * reach * direction for j in range(image.steps + 1)]
@@ -164,7 +164,7 @@ def ray_visibility(image: Image, start: Floats, direction: Floats, reach: float)
                 total = before + (after or 0.0)
                 part = before / total if total > 0.0 else 0.0  # Eq. 1
             distance = (j - 1 + part) / image.steps
-            return (distance**image.falloff if distance < 1.0 else 1.0), share
+            return (distance**image.falloff if distance < 1.0 else 1.0), 1.0
         before = after
     return 1.0, share
 

@@ -9,8 +9,8 @@ below the plane. The first step inside a solid is a hit, at the distance of Eq. 
 1 - W_p(distance / R) with one.
 Layers 0, 1, 2, ... are entry, exit, entry, ...: inside is behind an entry and before the next valid exit, and, with
 a thickness, no deeper than that behind the entry.
-Steps off the screen or behind the eye never occlude; a ray counts by the share of its steps that fall in the image
-(whatever they meet), and pixels of which nothing was seen are open. Invalid samples are open space.
+Steps off the screen or behind the eye never occlude; a ray without a hit counts by the share of its steps that fall in
+the image, one with a hit in full, and pixels of which nothing was seen are open. Invalid samples are open space.
 Gradients: "exact" - almost everywhere, hits held constant: through Eq. 1 and W. "surrogate" - a hit differentiates as
 sigmoid(depth behind / width) (exits and thickness alike) around the hard value. "soft" - value and gradient of the
 sigmoid form itself, which darkens planes at grazing rays.
@@ -255,12 +255,13 @@ class _Piece:
         pixels = Pixels(*cut)  # type: ignore[arg-type]
         place = hit.march(pixels, hit.directions(pixels.normal, *self.sampling), spec.steps)
         self.steps = _read(place, inputs, block, spec)
-        self.weight = self.steps.seen.to(pixels.reach.dtype).mean(0)
         rows = _rows(stored, self.steps.sample)
         behind, height = hit.depth_behind(place, rows, spec.orthographic)
         thickness = None if pixels.thickness is None else pixels.thickness * pixels.reach
         known = self.steps.known
         self.inside = self.steps.seen & hit.is_inside(behind, height, known, hit.tolerance(pixels), thickness)
+        seen = self.steps.seen.to(pixels.reach.dtype).mean(0)
+        self.weight = torch.where(self.inside.any(0), 1.0, seen)  # what lies behind a hit does not matter
         self.rows_at = self.steps.sample
         if spec.gradient == "exact":
             self.found = self.inside.any(0)
