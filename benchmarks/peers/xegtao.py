@@ -23,6 +23,7 @@ PRESETS = {"low": (1, 2), "medium": (2, 2), "high": (3, 3), "ultra": (9, 3)}  # 
 _PULL = 0.99999  # of the centre's depth, so that a surface does not occlude itself (single precision)
 _NEAREST = 1.3  # pixels; taps keep this far from the centre
 _LEVELS = 5
+_STEEPEST = 1.0 - 1e-6  # cosine of a horizon: the derivative of its angle stays finite
 _SKY = 1e5  # of the radius: the depth of pixels without a surface
 
 
@@ -144,7 +145,7 @@ class XeGTAO(AmbientVisibility):
                 delta, seen = pixels.tap(side * away * x, side * away * y, away)
                 found = self._faded(delta, seen, pixels, lowest)
                 horizon = torch.maximum(horizon, found)
-            angle = side * horizon.clamp(-1.0, 1.0).arccos()
+            angle = side * horizon.clamp(-_STEEPEST, _STEEPEST).arccos()
             total = total + 0.25 * (cosine + 2.0 * angle * gamma.sin() - (2.0 * angle - gamma).cos())
         return weight * total
 
