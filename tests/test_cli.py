@@ -229,6 +229,8 @@ def test_an_unknown_technique_names_the_choices(capsys: pytest.CaptureFixture[st
         ("--technique raymarch --no-quadrants", "--quadrants must be left out with --technique ray_march"),
         ("--slices 2", "--slices must be left out with --technique statvo, which has --layers, --quadrants"),
         ("--technique hbao --estimator magic", "estimator must be one of"),
+        ("--technique hbao --weighting magic", "weighting must be one of"),
+        ("--technique hbao --offscreen magic", "offscreen must be one of"),
         ("--technique hbao --slices 0", "slices must be a whole number at least 1"),
         ("--technique hbao --thickness thick", "--thickness: must be a positive number or none, got 'thick'"),
         ("--technique hbao --thickness -1", "thickness must be finite and greater than 0"),

@@ -48,7 +48,7 @@ def test_counts_of_a_pair_go_together() -> None:
 def test_a_count_left_out_is_the_default_of_the_technique() -> None:
     assert names_of("hbao", 0.5, (1,), {"slices": (2, 3)}) == [f"hbao_{n}x{HBAO().steps}" for n in (2, 3)]
     assert names_of("ray_march", 0.5, (1,), {"steps": 2}) == [f"ray_march_{RayMarchedSSAO().rays}x2"]
-    assert names_of("hbao", 0.5) == ["hbao_3x4", "hbao_4x8"]
+    assert names_of("hbao", 0.5) == ["hbao_2x4", "hbao_3x6"]
     assert names_of("ray_march", 0.5) == ["ray_march_16x8"]
 
 

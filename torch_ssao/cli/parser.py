@@ -94,7 +94,7 @@ def _add_measure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-evaluations", type=int, metavar="N", help=budget)
     note = (
         "One fit for each count; counts of a pair are taken together, --slices 3,4 --steps 4,8 is 3x4 and 4x8.\n"
-        "Left out: 1, 2, 4 and 8 layers; 3x4 and 4x8 slices and steps; 16x8 rays and steps."
+        "Left out: 1, 2, 4 and 8 layers; 2x4 and 3x6 slices and steps; 16x8 rays and steps."
     )
     techniques.add_options(parser, _numbers, "N,N", note)
 

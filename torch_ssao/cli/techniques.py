@@ -30,6 +30,8 @@ OPTIONS = (
     "rays",
     "steps",
     "estimator",
+    "weighting",
+    "offscreen",
     "thickness",
     "denoise",
 )
@@ -57,6 +59,8 @@ def add_options(parser: argparse.ArgumentParser, count: Callable[[str], Any], me
     add("layering", "adaptive or uniform", metavar="NAME")
     add("sat_scale", "1, 2 or 4: tables at full, half or quarter resolution", type=int, metavar="N")
     add("estimator", "bitmask or increments", metavar="NAME")
+    add("weighting", "cosine or uniform", metavar="NAME")
+    add("offscreen", "open: what is off the image never occludes; extend: border surfaces go on", metavar="NAME")
     text = (
         "depth of occluders behind what is seen of them, of the radius, where a fit starts; none: infinite, not fitted"
     )

@@ -15,12 +15,12 @@ COUNTS: dict[str, tuple[str, ...]] = {
     "ray_march": ("rays", "steps"),
 }
 """The counts of each technique that speed and error depend on."""
-SWEEPS: dict[str, tuple[tuple[int, ...], ...]] = {"hbao": ((3, 4), (4, 8)), "ray_march": ((16, 8),)}
+SWEEPS: dict[str, tuple[tuple[int, ...], ...]] = {"hbao": ((2, 4), (3, 6)), "ray_march": ((16, 8),)}
 """Counts that are measured where none are given; `LAYERS` for techniques with layers."""
 TITLES = {"statvo": "StatVO", "hbao": "HBAO", "ray_march": "ray march"}
 """Techniques by name in `TECHNIQUES`, for people."""
 MEANINGS = {
-    "hbao": "HBAO 3x4: 3 slices with 4 taps on either side of the pixel.",
+    "hbao": "HBAO 3x6: 3 slices with 6 taps on either side of the pixel.",
     "ray_march": "Ray march 16x8: 16 rays of 8 steps.",
 }
 
