@@ -3,9 +3,9 @@
     python -m benchmarks.real_scenes FOLDER [--scenes bunny ...] [--models techniques ...] [--samples 1024] [--pictures DIR]
 
 FOLDER holds meshes and a scenes.json with cameras and radii (see `ts.scenes.load`). References are binary, traced once and kept in
-out/real_scenes. Models are fitted at the fit size and judged at the full size: a radius in scene units depends on neither (those
-with constants in pixels are fitted at full size). PSNR is that of the mean squared error over all judged views. Rows go to
-benchmarks/results/real_scenes.json, beside earlier ones. --models takes names and groups of `models.py`; --summary prints only.
+out/real_scenes. Models are fitted at the fit size and judged at the full size: a radius in scene units depends on neither. PSNR is
+that of the mean squared error over all judged views. Rows go to benchmarks/results/real_scenes.json, beside earlier ones.
+--models takes names and groups of `models.py`; --summary prints only.
 """
 
 from __future__ import annotations
@@ -74,10 +74,9 @@ class SceneRun:
         (width, height), (fit_width, fit_height) = arguments.size, arguments.fit_size
         views = list(range(1, len(scene.cameras)))
         everything = ts.scenes.render(scene, height=height, width=width)
-        self.judged, self.large = everything[views], everything[0]
+        self.judged = everything[views]
         self.small = ts.scenes.render(scene, views=0, height=fit_height, width=fit_width)
         self.small_target = truth(scene, [0], arguments.fit_size, arguments.samples).visibility
-        self.large_target = truth(scene, [0], arguments.size, arguments.samples).visibility
         self.truth = truth(scene, views, arguments.size, arguments.samples)
         self.wanted, self.valid = self.truth.visibility, self.truth.valid
         self.rows: list[dict[str, Any]] = []
@@ -121,12 +120,35 @@ class SceneRun:
             return module, {"values": self.fitted[model.like], "like": model.like}
         if model.parameters == ():
             return module, {}
-        view = (self.large, self.large_target) if model.full_size else (self.small, self.small_target)
+        if model.search:
+            self._search(module, model)
         fit = ts.fitting.fit(
-            *(module, *view), parameters=model.parameters, max_evaluations=model.evaluations, progress=False
+            module,
+            *(self.small, self.small_target),
+            parameters=model.parameters,
+            max_evaluations=model.evaluations,
+            progress=False,
         )
         self.fitted[name] = {key: round(value, 5) for key, value in fit.values.items()}
         return fit.module, {"values": self.fitted[name], "training_rmse": round(fit.rmse, 5)}
+
+    def _search(self, module: AmbientVisibility, model: Model) -> None:
+        """Set a module to the best of random settings."""
+        generator = torch.Generator().manual_seed(0)
+        valid = self.small.valid_mask[:, :1]
+        start = {name: float(getattr(module, name)) for name in model.parameters or module.used_parameters()}
+        best, kept = math.inf, start
+        for _ in range(model.search):
+            factors = 2 ** (2 * torch.rand(len(start), generator=generator) - 1)
+            tried = {name: value * float(f) for (name, value), f in zip(start.items(), factors, strict=True)}
+            for name, value in tried.items():
+                setattr(module, name, value)
+            with torch.no_grad():
+                error = float(ts.metrics.rmse(module(self.small), self.small_target, valid))
+            if error < best:
+                best, kept = error, tried
+        for name, value in kept.items():
+            setattr(module, name, value)
 
     def _picture(self, name: str, image: Tensor) -> None:
         """Every judged view: reference, prediction, and half of their difference about grey."""

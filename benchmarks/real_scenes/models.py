@@ -20,7 +20,8 @@ class Model:
         evaluations: budget of the fit.
         like: name of the model whose fitted values it takes over, instead of a fit of its own: what HBAO and the ray march
             estimate does not depend on the number of taps.
-        full_size: fitted at the size it is judged at. For techniques whose constants are pixels.
+        search: random settings, within a factor of two of the start, of which the best is where the fit begins. For a peer
+            whose derivatives miss what its taps do.
         taps: depth reads a pixel; 0 where it is not taps that it is made of.
     """
 
@@ -28,7 +29,7 @@ class Model:
     parameters: tuple[str, ...] | None = None
     evaluations: int = 300
     like: str | None = None
-    full_size: bool = False
+    search: int = 0
     taps: int = 0
 
 
@@ -104,7 +105,7 @@ def _xegtao(preset: str, parameters: tuple[str, ...] = (), like: str | None = No
     return Model(
         lambda radius: XeGTAO(radius, slices=slices, steps=steps, thin_occluder=thin, denoise=1),
         *(parameters, 160, like),
-        full_size=True,
+        search=400,
         taps=2 * slices * steps,
     )
 
