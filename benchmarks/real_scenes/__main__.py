@@ -115,9 +115,11 @@ class SceneRun:
     def _fit(self, name: str, model: Model) -> tuple[AmbientVisibility, dict[str, Any]]:
         module = model.make(self.scene.radius)
         if model.like is not None:
+            values = self._values_of(model.like)
             for parameter in MODELS[model.like].parameters or module.used_parameters():
-                setattr(module, parameter, self.fitted[model.like][parameter])
-            return module, {"values": self.fitted[model.like], "like": model.like}
+                setattr(module, parameter, values[parameter])
+            if not model.refine:
+                return module, {"values": values, "like": model.like}
         if model.parameters == ():
             return module, {}
         if model.search:
@@ -126,11 +128,20 @@ class SceneRun:
             module,
             *(self.small, self.small_target),
             parameters=model.parameters,
-            max_evaluations=model.evaluations,
+            max_evaluations=model.refine or model.evaluations,
+            scan=not model.refine,
             progress=False,
         )
         self.fitted[name] = {key: round(value, 5) for key, value in fit.values.items()}
         return fit.module, {"values": self.fitted[name], "training_rmse": round(fit.rmse, 5)}
+
+    def _values_of(self, name: str) -> dict[str, float]:
+        """Fitted values of a model, of this run or an earlier one."""
+        if name not in self.fitted:
+            rows = json.loads(RESULTS.read_text(encoding="utf-8"))["rows"]
+            key = (self.name, name, self.arguments.samples)
+            self.fitted[name] = next(row["values"] for row in rows if _key(row) == key)
+        return self.fitted[name]
 
     def _search(self, module: AmbientVisibility, model: Model) -> None:
         """Set a module to the best of random settings."""

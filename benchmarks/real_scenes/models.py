@@ -20,6 +20,7 @@ class Model:
         evaluations: budget of the fit.
         like: name of the model whose fitted values it takes over, instead of a fit of its own: what HBAO and the ray march
             estimate does not depend on the number of taps.
+        refine: evaluations of a fit that goes on from there.
         search: random settings, within a factor of two of the start, of which the best is where the fit begins. For a peer
             whose derivatives miss what its taps do.
         taps: depth reads a pixel; 0 where it is not taps that it is made of.
@@ -29,6 +30,7 @@ class Model:
     parameters: tuple[str, ...] | None = None
     evaluations: int = 300
     like: str | None = None
+    refine: int = 0
     search: int = 0
     taps: int = 0
 
@@ -52,11 +54,17 @@ XEGTAO = ("radius", "falloff_range", "distribution_power", "final_power", "thin_
 
 
 def _bitmask(
-    slices: int, steps: int, *, connected: bool = False, offscreen: str = "extend", like: str | None = None
+    slices: int,
+    steps: int,
+    *,
+    connected: bool = False,
+    offscreen: str = "extend",
+    like: str | None = None,
+    refine: int = 0,
 ) -> Model:
     return Model(
         lambda radius: ts.HBAO(radius, slices=slices, steps=steps, connected=connected, offscreen=offscreen, denoise=1),
-        *(BITMASK, 90, like),
+        *(BITMASK, 90, like, refine),
         taps=2 * slices * steps,
     )
 
@@ -117,9 +125,9 @@ TECHNIQUES = {
     "HBAO bitmask 2x8": _bitmask(2, 8),
     "HBAO bitmask 2x8, open border": _bitmask(2, 8, offscreen="open", like="HBAO bitmask 2x8"),
     "HBAO bitmask 4x4, connected": _bitmask(4, 4, connected=True, like="HBAO bitmask 3x6, connected"),
-    "HBAO bitmask 4x8": _bitmask(4, 8, like="HBAO bitmask 2x8"),
-    "HBAO bitmask 2x16": _bitmask(2, 16, like="HBAO bitmask 2x8"),
-    "HBAO bitmask 8x16": _bitmask(8, 16, like="HBAO bitmask 2x8"),
+    "HBAO bitmask 4x8": _bitmask(4, 8, like="HBAO bitmask 2x8", refine=40),
+    "HBAO bitmask 2x16": _bitmask(2, 16, like="HBAO bitmask 2x8", refine=40),
+    "HBAO bitmask 8x16": _bitmask(8, 16, like="HBAO bitmask 2x8", refine=40),
     "HBAO increments 3x6": _increments(3, 6),
     "HBAO increments 3x3": _increments(3, 3, like="HBAO increments 3x6"),
     "HBAO increments 4x8": _increments(4, 8, like="HBAO increments 3x6"),
