@@ -1,38 +1,40 @@
-"""Tables over scenes and models."""
+"""The table over scenes and models, as docs/hbao.md has it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 Rows = list[dict[str, Any]]
+PEER = "XeGTAO High, tuned"
 
 
 def summarise(rows: Rows) -> str:
-    """PSNR by scene, then over all scenes: PSNR of the pooled squared error, SSIM, milliseconds, gain over the tuned peer."""
+    """PSNR by scene; over all scenes RMSE and PSNR of the pooled squared error, its gain over the tuned peer, SSIM, time."""
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     models = list(dict.fromkeys(row["model"] for row in rows))
     found = {(row["scene"], row["model"]): row for row in rows}
-    pooled = {model: _pooled([found[s, model] for s in scenes if (s, model) in found]) for model in models}
-    peer = pooled.get("XeGTAO High, tuned", math.nan)
-    lines = [f"{'PSNR':32}" + "".join(f"{s[:9]:>10}" for s in scenes) + "    pooled  over peer   SSIM    ms"]
+    common = [scene for scene in scenes if all((scene, model) in found for model in models)]
+    left = (
+        f" (left out of the pool, for want of rows: {', '.join(set(scenes) - set(common))})" if common != scenes else ""
+    )
+    peer = _pooled([found[scene, PEER] for scene in common]) if PEER in models and common else math.nan
+    heads = ["model", "taps", *(scene.replace("_", " ") for scene in scenes), "RMSE", "PSNR", "over peer", "SSIM", "ms"]
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     for model in models:
-        mine = [found[s, model] for s in scenes if (s, model) in found]
-        cells = "".join(f"{found[s, model]['psnr']:10.2f}" if (s, model) in found else f"{'-':>10}" for s in scenes)
-        tail = (
-            f"{pooled[model]:10.2f} {pooled[model] - peer:+10.2f} {_mean(mine, 'ssim'):6.4f} {_mean(mine, 'ms'):6.0f}"
-        )
-        lines.append(f"{model:32}{cells}{tail}")
-    return "\n".join(lines)
+        mine = [found[scene, model] for scene in common]
+        psnr = _pooled(mine) if mine else math.nan
+        cells = [f"{found[s, model]['psnr']:.2f}" if (s, model) in found else "-" for s in scenes]
+        tail = [f"{10 ** (-psnr / 20):.4f}", f"{psnr:.2f}", f"{psnr - peer:+.2f}", f"{_mean(mine, 'ssim'):.4f}"]
+        taps = next((str(row["taps"]) for row in mine if row.get("taps")), "-")
+        time = f"{_mean(mine, 'ms'):.0f}" if any("ms" in row for row in mine) else "-"
+        lines.append("| " + " | ".join([model, taps, *cells, *tail, time]) + " |")
+    return "\n".join(lines) + left
 
 
 def _pooled(rows: Rows) -> float:
-    """PSNR of the mean squared error over all judged pixels of all scenes, every view alike; NaN without them."""
-    if not rows or any("mse" not in row for row in rows):
-        return math.nan
-    total: Callable[[str], float] = lambda key: sum(row[key] for row in rows)  # noqa: E731
-    error = sum(row["mse"] * row["pixels"] for row in rows) / total("pixels")
+    """PSNR of the mean squared error over all judged pixels of all scenes."""
+    error = sum(row["mse"] * row["pixels"] for row in rows) / sum(row["pixels"] for row in rows)
     return -10 * math.log10(error)
 
 
