@@ -14,6 +14,7 @@ import argparse
 import fcntl
 import json
 import math
+import statistics
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -53,16 +54,10 @@ def judge(prediction: Tensor, target: Tensor, valid: Tensor) -> dict[str, Any]:
     }
 
 
-def predict(module: AmbientVisibility, gbuffer: ts.GBuffer) -> tuple[Tensor, float]:
-    """Images of all views, one at a time, and the median milliseconds of a view."""
-    images, times = [], []
+def predict(module: AmbientVisibility, gbuffer: ts.GBuffer) -> Tensor:
+    """Images of all views, one at a time."""
     with torch.no_grad():
-        module(gbuffer[0])  # the first call allocates
-        for view in range(len(gbuffer)):
-            start = time.perf_counter()
-            images.append(module(gbuffer[view]))
-            times.append(time.perf_counter() - start)
-    return torch.cat(images), 1e3 * sorted(times)[len(times) // 2]
+        return torch.cat([module(gbuffer[view]) for view in range(len(gbuffer))])
 
 
 class SceneRun:
@@ -106,11 +101,23 @@ class SceneRun:
     def measure(self, name: str, model: Model) -> None:
         """Fit a model, or take over another's values, and judge it."""
         module, facts = self._fit(name, model)
-        image, milliseconds = predict(module, self.judged)
-        facts |= {"taps": model.taps, "ms": round(milliseconds, 1)}
+        image, facts["taps"] = predict(module, self.judged), model.taps
         self.add(name, **judge(image, self.wanted, self.valid), **facts)
         if self.arguments.pictures:
             self._picture(name, image)
+
+    def time(self, names: list[str], rounds: int = 3) -> dict[str, float]:
+        """Milliseconds of the first judged view, medians of rounds in which the models take turns, at their default values."""
+        modules = {name: MODELS[name].make(self.scene.radius) for name in names}
+        times: dict[str, list[float]] = {name: [] for name in names}
+        with torch.no_grad():
+            for number in range(rounds + 1):
+                for name, module in modules.items():
+                    start = time.perf_counter()
+                    module(self.judged[0])
+                    if number:  # the first round allocates
+                        times[name].append(1e3 * (time.perf_counter() - start))
+        return {name: round(statistics.median(taken), 1) for name, taken in times.items()}
 
     def _fit(self, name: str, model: Model) -> tuple[AmbientVisibility, dict[str, Any]]:
         module = model.make(self.scene.radius)
@@ -138,7 +145,7 @@ class SceneRun:
     def _values_of(self, name: str) -> dict[str, float]:
         """Fitted values of a model, of this run or an earlier one."""
         if name not in self.fitted:
-            rows = json.loads(RESULTS.read_text(encoding="utf-8"))["rows"]
+            rows = stored()["rows"]
             key = (self.name, name, self.arguments.samples)
             self.fitted[name] = next(row["values"] for row in rows if _key(row) == key)
         return self.fitted[name]
@@ -175,12 +182,17 @@ def keep(rows: list[dict[str, Any]], arguments: argparse.Namespace) -> None:
     CACHE.mkdir(parents=True, exist_ok=True)
     with (CACHE / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        RESULTS.write_text(json.dumps(facts | {"rows": merge(rows)}, indent=1) + "\n", encoding="utf-8")
+        RESULTS.write_text(json.dumps(stored() | facts | {"rows": merge(rows)}, indent=1) + "\n", encoding="utf-8")
+
+
+def stored() -> dict[str, Any]:
+    """What is on disk."""
+    return json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {"rows": []}
 
 
 def merge(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The rows on disk with these in their place."""
-    kept = json.loads(RESULTS.read_text(encoding="utf-8"))["rows"] if RESULTS.exists() else []
+    kept = stored()["rows"]
     new = {_key(row) for row in rows}
     return sorted([row for row in kept if _key(row) not in new] + rows, key=lambda row: row["scene"])
 
@@ -203,6 +215,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--fit-size", type=_size, default=(240, 180))
     parser.add_argument("--samples", type=int, default=1024)
     parser.add_argument("--pictures", type=Path, help="folder for a picture a scene and model")
+    parser.add_argument("--times", action="store_true", help="time the models on the first scene, measure nothing else")
     parser.add_argument("--summary", action="store_true", help="print the tables of earlier rows, measure nothing")
     return parser.parse_args()
 
@@ -211,15 +224,20 @@ def main() -> None:
     arguments = _arguments()
     known = json.loads((arguments.folder / "scenes.json").read_text(encoding="utf-8"))
     names = [name for given in arguments.models for name in GROUPS.get(given, (given,))]
-    for name in () if arguments.summary else arguments.scenes or list(known):
+    scenes = arguments.scenes or list(known)
+    if arguments.times:
+        run = SceneRun(arguments.folder, scenes[0], known[scenes[0]]["file"], arguments)
+        times = {"scene": scenes[0], "environment": environment(), "ms": run.time(names)}
+        RESULTS.write_text(json.dumps(stored() | {"times": times}, indent=1) + "\n", encoding="utf-8")
+    for name in () if arguments.summary or arguments.times else scenes:
         run = SceneRun(arguments.folder, name, known[name]["file"], arguments)
         run.constants()
         run.ceiling()
         for model in names:
             run.measure(model, MODELS[model])
             keep(run.rows, arguments)
-    rows = json.loads(RESULTS.read_text(encoding="utf-8"))["rows"]
-    print(summarise([row for row in rows if row["samples"] == arguments.samples]))
+    rows = [row for row in stored()["rows"] if row["samples"] == arguments.samples]
+    print(summarise(rows, stored().get("times", {}).get("ms", {})))
 
 
 if __name__ == "__main__":

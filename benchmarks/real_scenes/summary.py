@@ -9,10 +9,16 @@ Rows = list[dict[str, Any]]
 PEER = "XeGTAO High, tuned"
 
 
-def summarise(rows: Rows) -> str:
-    """PSNR by scene; over all scenes RMSE and PSNR of the pooled squared error, its gain over the tuned peer, SSIM, time."""
+def summarise(rows: Rows, times: dict[str, float]) -> str:
+    """PSNR by scene; over all scenes RMSE and PSNR of the pooled squared error, its gain over the tuned peer, SSIM, time.
+
+    Args:
+        rows: of one sample count.
+        times: milliseconds by model.
+    """
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    models = list(dict.fromkeys(row["model"] for row in rows))
+    order = [*times, *(row["model"] for row in rows)]
+    models = [model for model in dict.fromkeys(order) if any(row["model"] == model for row in rows)]
     found = {(row["scene"], row["model"]): row for row in rows}
     common = [scene for scene in scenes if all((scene, model) in found for model in models)]
     left = (
@@ -27,7 +33,7 @@ def summarise(rows: Rows) -> str:
         cells = [f"{found[s, model]['psnr']:.2f}" if (s, model) in found else "-" for s in scenes]
         tail = [f"{10 ** (-psnr / 20):.4f}", f"{psnr:.2f}", f"{psnr - peer:+.2f}", f"{_mean(mine, 'ssim'):.4f}"]
         taps = next((str(row["taps"]) for row in mine if row.get("taps")), "-")
-        time = f"{_mean(mine, 'ms'):.0f}" if any("ms" in row for row in mine) else "-"
+        time = f"{times[model]:.0f}" if model in times else "-"
         lines.append("| " + " | ".join([model, taps, *cells, *tail, time]) + " |")
     return "\n".join(lines) + left
 
