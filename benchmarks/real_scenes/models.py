@@ -128,7 +128,6 @@ TECHNIQUES = {
     "HBAO bitmask 4x8": _bitmask(4, 8, like="HBAO bitmask 2x8", refine=40),
     "HBAO bitmask 2x16": _bitmask(2, 16, like="HBAO bitmask 2x8", refine=40),
     "HBAO bitmask 8x16": _bitmask(8, 16, like="HBAO bitmask 2x8", refine=40),
-    "HBAO bitmask 4x32": _bitmask(4, 32, like="HBAO bitmask 2x8", refine=40),
     "HBAO increments 3x6": _increments(3, 6),
     "HBAO increments 3x3": _increments(3, 3, like="HBAO increments 3x6"),
     "HBAO increments 4x8": _increments(4, 8, like="HBAO increments 3x6"),
