@@ -223,8 +223,6 @@ def side_covered(taps: list[Tap], plane: Slice, side: int, radius: float, s: Set
         before = taps[number - 1] if number else None
         if s.connected and connected(tap, before, CONNECTED, min(thick, LINK_STEP * radius), back=True):
             start = plane.point if before is None else before.place
-            if abs(tap.towards - (0.0 if before is None else before.towards)) > radius:
-                continue
             length = float(np.linalg.norm(tap.place - start))
             ray = (tap.place - start) / length
             part = inside_sphere(start, ray, length, plane.point, radius)

@@ -154,7 +154,6 @@ def _links(measure: Measure, frame: Frame, taps: Taps, thickness: Tensor | None)
     zero = torch.zeros_like(along[:, :, :1])
     from_along, from_towards = torch.cat((zero, along[:, :, :-1]), 2), torch.cat((zero, towards[:, :, :-1]), 2)
     same = _connected(taps, CONNECTED_SLOPE, near, back=True)
-    same = same & ((towards - from_towards).abs() <= frame.radius)  # what lies further behind is another surface
     across, rise = torch.where(same, along - from_along, 1.0), torch.where(same, towards - from_towards, 0.0)
     length = (across**2 + rise**2).sqrt()
     across, rise = across / length, rise / length
