@@ -105,7 +105,9 @@ def _conclude(
             setattr(fitted, name, value)
     residuals.budget += len(space)  # kept back from the search for this Jacobian
     jacobian = residuals.jacobian(log)
-    jacobian = torch.where(jacobian.isfinite(), jacobian, 0.0)  # the fit is done: a bad column is an undetermined parameter
+    jacobian = torch.where(
+        jacobian.isfinite(), jacobian, 0.0
+    )  # the fit is done: a bad column is an undetermined parameter
     # Without a stated noise of the target, the size of each residual stands in for it.
     spread = best.abs() if noise is None else residuals.gather(weight.sqrt() * noise.to(weight.device).double())
     deviations = uncertainty.covariance(jacobian, spread).diagonal().clamp(min=0).sqrt().tolist()
