@@ -105,9 +105,8 @@ def _conclude(
             setattr(fitted, name, value)
     residuals.budget += len(space)  # kept back from the search for this Jacobian
     jacobian = residuals.jacobian(log)
-    jacobian = torch.where(
-        jacobian.isfinite(), jacobian, 0.0
-    )  # the fit is done: a bad column is an undetermined parameter
+    # The fit is done: a column that is not finite is an undetermined parameter, not a reason to lose it.
+    jacobian = torch.where(jacobian.isfinite(), jacobian, 0.0)
     # Without a stated noise of the target, the size of each residual stands in for it.
     spread = best.abs() if noise is None else residuals.gather(weight.sqrt() * noise.to(weight.device).double())
     deviations = uncertainty.covariance(jacobian, spread).diagonal().clamp(min=0).sqrt().tolist()

@@ -101,17 +101,7 @@ def horizon_obscurance(
 
 
 def evaluate_horizon(
-    depth: Tensor,
-    valid: Tensor,
-    normal: Tensor,
-    intrinsics: Tensor,
-    radius: Tensor,
-    falloff: Tensor,
-    thickness: Tensor | None,
-    bias: Tensor,
-    rotation: Tensor,
-    offset: Tensor,
-    *,
+    *tensors: Any,
     orthographic: bool,
     slices: int,
     steps: int,
@@ -124,10 +114,11 @@ def evaluate_horizon(
     footprint_step: float = FOOTPRINT_STEP,
     bent: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Obscurance and, with `bent`, the mean direction of what is occluded: `horizon_obscurance` says how.
+    """Obscurance and, with `bent`, the mean direction of what is occluded: `horizon_obscurance` says how, and names the tensors.
 
     Returns: (B, 1 or 4, H, W), not clamped, meaningless at invalid pixels; and the normals that were used.
     """
+    depth, valid, normal, intrinsics, radius, falloff, thickness, bias, rotation, offset = tensors
     checks.check_choice("weighting", weighting, WEIGHTINGS)
     checks.check_choice("estimator", estimator, ESTIMATORS)
     checks.check_choice("offscreen", offscreen, OFFSCREEN)

@@ -10,9 +10,8 @@ from torch import Tensor
 from torch_ssao.ops.horizon import evaluate_horizon
 from torch_ssao.ops.horizon_moments import HEMISPHERE
 
-CLOSED = (
-    1e-4  # less visibility, or less of the mean open direction along the normal, is what rounding and few slices leave
-)
+# Less visibility, or less of the mean open direction along the normal, is what rounding and few slices leave.
+CLOSED = 1e-4
 
 
 def horizon_bent_normal(*tensors: Any, weighting: str, **options: Any) -> tuple[Tensor, Tensor]:
