@@ -78,7 +78,8 @@ def ray_march_visibility(
     Returns: (B, H, W) in [0, 1]; 1 at invalid pixels, and it fades to 1 where the reach spans less than a pixel.
     Gradients: to points, normal, reach, falloff and (not "exact") thickness; to intrinsics through the fading alone, and
         to the camera through points. Forward mode alike. Second derivatives raise a RuntimeError.
-    Cost: K steps reads of L samples, and twice as many more in a derivative to the reach; saved: the inputs and two floats a pixel, whatever the rays and steps.
+    Cost: K steps reads of L samples, in a derivative to the reach three times as many; saved: the inputs and two floats a
+        pixel, whatever the rays and steps.
     Raises: RangeError, ChoiceError.
     Source: Poisson-based ray-marched SSAO, Algorithm 1, Eqs. 1 and 2.
     """
