@@ -190,34 +190,53 @@ class _March(NamedTuple):
     def value(self, *tensors: Tensor | None) -> Outputs:
         inputs = _inputs(tensors, self.spec)
         stored = _stored(inputs.planes, inputs.pyramid)
-        total, weight = torch.zeros_like(inputs.reach), torch.zeros_like(inputs.reach)
-        for block in self.blocks(inputs):
-            piece = _Piece(self, block, inputs, stored)
-            total[block.images, block.pixels] += piece.visibility(*piece.leaves)[0]
-            weight[block.images, block.pixels] += piece.weight.sum(0)
-        seen = inputs.valid[:, :, 0] & (weight > 0)
+        visibility, weight = torch.empty_like(inputs.reach), torch.empty_like(inputs.reach)
+        for rays in self.blocks(inputs):
+            at = rays[0].images, rays[0].pixels
+            visibility[at], weight[at] = self.value_of(rays, inputs, stored)
+        return visibility, weight
+
+    def value_of(
+        self, rays: Sequence[_Block], inputs: _Inputs, stored: Tensor, spread: float = 1.0
+    ) -> tuple[Tensor, Tensor]:
+        """Visibility (b, P) of the pixels of blocks that differ in their rays alone, and the rays' weight, inf where unseen."""
+        total: Tensor | float = 0.0
+        weight: Tensor | float = 0.0
+        for block in rays:
+            piece = _Piece(self, block, inputs, stored, spread)
+            total = total + piece.visibility(*piece.leaves)[0]
+            weight = weight + piece.weight.sum(0)
+        weight = torch.as_tensor(weight)
+        seen = inputs.valid[rays[0].images, rays[0].pixels, 0] & (weight > 0)
         return torch.where(seen, total / weight.clamp(min=1e-6), 1.0), torch.where(seen, weight, torch.inf)
+
+    def by_reach(self, rays: Sequence[_Block], inputs: _Inputs, stored: Tensor) -> Tensor:
+        """(b, P) derivative of the value to the reach, by differences: longer rays read other pixels."""
+        spreads = (1 + self.reach_step, 1 - self.reach_step)
+        further, nearer = (self.value_of(rays, inputs, stored, spread)[0] for spread in spreads)
+        return (further - nearer) / (2 * self.reach_step * inputs.reach[rays[0].images, rays[0].pixels])
 
     def pull_back(
         self, grad: Tensor, needed: Sequence[bool], outputs: Outputs, *tensors: Tensor | None
     ) -> list[Tensor]:
-        by_reach = needed[2] and self.reach_step > 0
-        to_reach = grad * self.by_reach(*tensors) if by_reach else None  # first: what it takes is free again afterwards
         inputs = _inputs(tensors, self.spec)
         stored = _stored(inputs.planes, inputs.pyramid)
         per_ray = grad / outputs[1]
         totals = [None if t is None else torch.zeros_like(t) for t in inputs[:5]]
         to_stored = torch.zeros_like(stored)
         flat = to_stored.view(-1, stored.shape[2] * 4)
-        for block in self.blocks(inputs):
-            piece = _Piece(self, block, inputs, stored)
-            *parts, rows = pull_back(piece.visibility, piece.leaves, [per_ray[block.images, block.pixels]])
-            targets = [target for target in block.cut(totals) if target is not None]
-            for target, part in zip(targets, parts, strict=True):
-                target += part
-            if needed[5]:
-                flat.index_add_(0, piece.rows_at.flatten(), rows.flatten(0, -3).flatten(1))
-        totals[2] = totals[2] if to_reach is None else to_reach
+        for rays in self.blocks(inputs):
+            at = rays[0].images, rays[0].pixels
+            for block in rays:
+                piece = _Piece(self, block, inputs, stored)
+                *parts, rows = pull_back(piece.visibility, piece.leaves, [per_ray[at]])
+                targets = [target for target in block.cut(totals) if target is not None]
+                for target, part in zip(targets, parts, strict=True):
+                    target += part
+                if needed[5]:
+                    flat.index_add_(0, piece.rows_at.flatten(), rows.flatten(0, -3).flatten(1))
+            if needed[2] and self.reach_step > 0:
+                totals[2][at] = grad[at] * self.by_reach(rays, inputs, stored)  # type: ignore[index]
         planes = to_stored
         if inputs.pyramid is not None:
             planes = torch.zeros_like(inputs.planes)
@@ -231,37 +250,25 @@ class _March(NamedTuple):
             None if t is None else (torch.zeros_like(t) if move is None else move)
             for t, move in zip(inputs[:6], tangents[:6], strict=True)
         ]
-        reached = self.push_reach(moves[2], *tensors) if self.reach_step > 0 else 0.0  # type: ignore[arg-type]
-        if self.reach_step > 0:
+        by_reach = None if tangents[2] is None or self.reach_step == 0 else tangents[2]
+        if by_reach is not None:
             moves[2] = torch.zeros_like(inputs.reach)
         total = torch.zeros_like(inputs.reach)
         moved = _stored(moves[5], inputs.pyramid)  # type: ignore[arg-type]
-        for block in self.blocks(inputs):
-            piece = _Piece(self, block, inputs, stored)
-            leaves = [move for move in block.cut(moves[:5]) if move is not None]
-            leaves.append(_rows(moved, piece.rows_at))
-            (pushed,) = push_forward(piece.visibility, piece.leaves, leaves)
-            total[block.images, block.pixels] += pushed
-        return total / outputs[1] + reached
+        for rays in self.blocks(inputs):
+            at = rays[0].images, rays[0].pixels
+            for block in rays:
+                piece = _Piece(self, block, inputs, stored)
+                leaves = [move for move in block.cut(moves[:5]) if move is not None]
+                leaves.append(_rows(moved, piece.rows_at))
+                (pushed,) = push_forward(piece.visibility, piece.leaves, leaves)
+                total[at] += pushed / outputs[1][at]
+            if by_reach is not None and bool(by_reach[at].any()):  # most columns of a Jacobian do not move the reach
+                total[at] += by_reach[at] * self.by_reach(rays, inputs, stored)
+        return total
 
-    def by_reach(self, *tensors: Tensor | None) -> Tensor:
-        """(B, N) derivative of the value to the reach, by differences: longer rays read other pixels."""
-        reach: Tensor = tensors[2]  # type: ignore[assignment]
-        further, nearer = (
-            self.value(*tensors[:2], reach * (1 + sign * self.reach_step), *tensors[3:])[0] for sign in (1, -1)
-        )
-        return (further - nearer) / (2 * self.reach_step * reach)
-
-    def push_reach(self, move: Tensor, *tensors: Tensor | None) -> Tensor:
-        """(B, N) what the reach's tangent adds; images where it is zero, such as most columns of a Jacobian, cost nothing."""
-        moving = move.any(1)
-        pushed = torch.zeros_like(move)
-        if bool(moving.any()):
-            some = [None if t is None else t[moving] for t in tensors]
-            pushed[moving] = move[moving] * self.by_reach(*some)
-        return pushed
-
-    def blocks(self, inputs: _Inputs) -> Iterator[_Block]:
+    def blocks(self, inputs: _Inputs) -> Iterator[list[_Block]]:
+        """Those of the same pixels together: they differ in their rays."""
         batch, count = inputs.reach.shape
         budget = max(1, _TAPS_AT_ONCE.get(inputs.reach.device.type, 2**17) // self.spec.steps)
         pixels = min(count, budget)
@@ -269,18 +276,23 @@ class _March(NamedTuple):
         rays = min(len(self.disk), max(1, budget // (pixels * images)))
         for image in range(0, batch, images):
             for pixel in range(0, count, pixels):
-                for ray in range(0, len(self.disk), rays):
-                    yield _Block(slice(ray, ray + rays), slice(image, image + images), slice(pixel, pixel + pixels))
+                at = slice(image, image + images), slice(pixel, pixel + pixels)
+                yield [_Block(slice(ray, ray + rays), *at) for ray in range(0, len(self.disk), rays)]
 
 
 class _Piece:
-    """The rays of a block: where their steps fall, and their visibility as a function of the differentiable inputs."""
+    """The rays of a block: where their steps fall, and their visibility as a function of the differentiable inputs.
 
-    def __init__(self, kernel: _March, block: _Block, inputs: _Inputs, stored: Tensor) -> None:
+    `spread` is a factor on the reach.
+    """
+
+    def __init__(self, kernel: _March, block: _Block, inputs: _Inputs, stored: Tensor, spread: float = 1.0) -> None:
         self.spec = spec = kernel.spec
         noise = kernel.rotation[block.pixels], kernel.offset[block.pixels]
         self.sampling = kernel.disk[block.rays], len(kernel.disk), *noise
         cut = block.cut(inputs[:5])
+        if spread != 1:
+            cut[2] = spread * inputs.reach[block.images, block.pixels]
         self.given = [part is not None for part in cut]
         pixels = Pixels(*cut)  # type: ignore[arg-type]
         place = hit.march(pixels, hit.directions(pixels.normal, *self.sampling), spec.steps)
