@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -10,16 +12,17 @@ from support.clutter import clutter
 from torch_ssao.fitting.parameters import ParameterSpace
 from torch_ssao.fitting.residuals import BudgetSpent, Residuals
 from torch_ssao.fitting.scan import scan_points
+from torch_ssao.fitting.views import gather_views
 
 NAMES = ("radius", "height", "falloff", "contrast")
 
 
-def _residuals(views: int = 2, budget: int = 100) -> tuple[Residuals, ParameterSpace]:
+def _residuals(views: int = 2, budget: int = 100, **options: Any) -> tuple[Residuals, ParameterSpace]:
     gbuffer = clutter(views=views).to(torch.float64)
     module = ts.StatVO(0.5, layers=2).double()
-    weight = gbuffer.valid_mask[:, :1].double()
-    target = torch.full_like(weight, 0.9)
-    return Residuals(module, gbuffer, target, weight / weight.sum(), NAMES, budget), ParameterSpace.of(module, NAMES)
+    target = torch.full_like(gbuffer.depth[:, :1], 0.9)
+    space = ParameterSpace.of(module, NAMES)
+    return Residuals([module], gather_views(gbuffer, target)[0], space, budget, **options), space
 
 
 def test_norm_is_the_rmse() -> None:

@@ -1,4 +1,5 @@
 """Fit techniques to references: parameters to R^n, forward-mode Jacobians, optimistix, standard errors."""
 
 from torch_ssao.fitting.fit import fit as fit
+from torch_ssao.fitting.priors import Prior as Prior
 from torch_ssao.fitting.result import FitResult as FitResult

@@ -1,4 +1,4 @@
-"""The bridge to optimistix: Levenberg-Marquardt in jax on residuals that torch evaluates. The one file with both.
+"""The bridge to optimistix: its solvers in jax on residuals that torch evaluates. The one file with both.
 
 jax is imported on first use, works on the CPU only and in float64. Importing this file loads neither jax nor optimistix.
 """
@@ -22,6 +22,7 @@ from torch_ssao.checks import MissingExtraError
 Array = NDArray[np.float64]
 Evaluate = Callable[[Array], tuple[Array, Array]]
 
+SOLVERS = ("levenberg_marquardt", "dogleg", "bfgs")
 MAX_STEPS = 256  # the budget of evaluations ends a solve long before
 TOLERANCE = 1e-6  # in u and in the scaled residuals: far below what a fit can tell apart
 
@@ -39,23 +40,24 @@ def check_installed() -> None:
         raise MissingExtraError("fit needs optimistix, which is not installed: run pip install torch_ssao[fitting]")
 
 
-def levenberg_marquardt(evaluate: Evaluate, start: Array) -> bool:
+def solve(solver: str, evaluate: Evaluate, start: Array) -> bool:
     """Minimise |r(u)|^2 from `start`.
 
     Args:
+        solver: one of `SOLVERS`; BFGS sees |r|^2 / 2 and its gradient J'r only.
         evaluate: u (P,) -> residuals (P + 1,) and Jacobian (P + 1, P), float64; what it raises ends the solve.
             Only the Jacobian at points that lower |r| is used.
         start: (P,) float64.
     Returns: whether the tolerances were met; False when `evaluate` raised `StopSolver` or the steps ran out. The caller keeps the
         best point that `evaluate` saw.
     Raises: whatever else `evaluate` raised, from here and not from inside jax.
-    Cost: one visit to `evaluate` a step; the solver is compiled once (about a second) for each P.
+    Cost: one visit to `evaluate` a step; a solver is compiled once (about a second) for each P.
     """
     with _LOCK, _float64_on_cpu():
         visit = _Visit(evaluate)
         _ACTIVE.append(visit)
         try:
-            converged = bool(_solver(len(start))(start))
+            converged = bool(_compiled(solver, len(start))(start))
         finally:
             _ACTIVE.pop()
     if visit.error is not None and not isinstance(visit.error, StopSolver):
@@ -99,9 +101,8 @@ def _float64_on_cpu() -> Iterator[None]:
 
 
 @functools.cache
-def _solver(size: int) -> Callable[[Array], Any]:
+def _compiled(solver: str, size: int) -> Callable[[Array], Any]:
     """The compiled solve for `size` parameters."""
-    import equinox
     import jax
     import jax.numpy as jnp
     import optimistix
@@ -120,20 +121,34 @@ def _solver(size: int) -> Callable[[Array], Any]:
         value, jacobian = visit(*primals)
         return value, jacobian @ tangents[0]
 
-    plain = optimistix.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE)
-    solver = equinox.tree_at(lambda s: s.search, plain, _trust_region(optimistix))
+    if solver == "bfgs":
+        method: Any = optimistix.BFGS(rtol=TOLERANCE, atol=TOLERANCE)
 
-    def solve(start: Any) -> Any:
-        solution = optimistix.least_squares(lambda u, _: residual(u), solver, start, max_steps=MAX_STEPS, throw=False)
-        return solution.result == optimistix.RESULTS.successful
+        def minimise(start: Any) -> Any:
+            def half_square(u: Any, _: Any) -> Any:
+                return 0.5 * jnp.sum(residual(u) ** 2)
 
-    return jax.jit(solve)  # type: ignore[no-any-return]
+            return optimistix.minimise(half_square, method, start, max_steps=MAX_STEPS, throw=False)
+    else:
+        method = _least_squares_solver(solver, optimistix)
+
+        def minimise(start: Any) -> Any:
+            return optimistix.least_squares(lambda u, _: residual(u), method, start, max_steps=MAX_STEPS, throw=False)
+
+    return jax.jit(lambda start: minimise(start).result == optimistix.RESULTS.successful)  # type: ignore[no-any-return]
 
 
-def _trust_region(optimistix: Any) -> Any:
+def _least_squares_solver(solver: str, optimistix: Any) -> Any:
     """Accept every descent: a visit that does not lower |r| is then surely rejected, and its Jacobian is never needed.
 
     The damping falls tenfold after a step that did at least half of what was predicted (optimistix asks for 99 %, which labels that
-    flip never let a step reach).
+    flip never let a step reach); the radius of the dogleg grows likewise.
     """
-    return optimistix.ClassicalTrustRegion(low_cutoff=0.0, high_cutoff=0.5, high_constant=10.0)
+    import equinox
+
+    if solver == "dogleg":
+        plain, growth = optimistix.Dogleg(rtol=TOLERANCE, atol=TOLERANCE), 3.5
+    else:
+        plain, growth = optimistix.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE), 10.0
+    search = optimistix.ClassicalTrustRegion(low_cutoff=0.0, high_cutoff=0.5, high_constant=growth)
+    return equinox.tree_at(lambda s: s.search, plain, search)

@@ -29,7 +29,7 @@ def polish(residuals: Residuals, space: ParameterSpace, *, first: float = FIRST)
     side = torch.ones(size, dtype=torch.float64)
     try:
         while delta > LAST and residuals.left > size:
-            before = residuals.rmse
+            before = residuals.least
             origin, base = _best(residuals)
             u = space.from_log(origin)
             columns = []
@@ -41,8 +41,8 @@ def polish(residuals: Residuals, space: ParameterSpace, *, first: float = FIRST)
             move = _step(jacobian, base, delta)
             residuals.value(space.to_log(u + move))
             side = torch.where(move.sign() == 0, side, move.sign())
-            gained = residuals.rmse < before * (1 - WORTH)
-            steps += residuals.rmse < before
+            gained = residuals.least < before * (1 - WORTH)
+            steps += residuals.least < before
             length = float(move.abs().max())
             delta = min(delta, max(length, delta / 8)) * (0.5 if gained else 0.25)
     except BudgetSpent:

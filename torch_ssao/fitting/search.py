@@ -1,8 +1,10 @@
-"""Scan, Levenberg-Marquardt from the best points of the scan, polish: one search within one budget."""
+"""Scan, descents from the best points of the scan, polish: one search within one budget."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import final
 
@@ -21,6 +23,7 @@ PERFECT = 1e-6  # RMSE at which float32 images agree: nothing is left to fit
 PATIENCE = 3  # visits without a relative gain of WORTH after which a descent has stalled
 WORTH = 1e-3
 FIRST_DAMPING = 1e-2  # of the largest diagonal entry of J'J, Marquardt's tau
+FIRST_CURVATURE = 1.0  # what BFGS, which starts from the identity, takes the largest diagonal entry of J'J for
 APART = 0.7  # distance in logarithms below which two scan points lead to the same place
 POLISH_ROUNDS = 4  # rounds of evaluations kept back for the polish
 STARTS = 32
@@ -47,38 +50,60 @@ class Outcome:
     converged: bool
 
 
-def search(residuals: Residuals, space: ParameterSpace, *, with_scan: bool) -> Outcome:
-    """Find the least |r| within the budget; the best point stays in `residuals`."""
-    candidates = scan(residuals, space) if with_scan else [space.start]
+def search(
+    residuals: Residuals,
+    space: ParameterSpace,
+    *,
+    with_scan: bool,
+    solver: str = "levenberg_marquardt",
+    batches: Iterator[list[int]] | None = None,
+) -> Outcome:
+    """Find the least |r| within the budget; the best point stays in `residuals`.
+
+    With `batches` (views, without end) the scan and each descent see one of them, and what they end at is then judged on all.
+    """
+    with _next_batch(residuals, batches):
+        candidates = scan(residuals, space) if with_scan else [space.start]
     reserve = min(POLISH_ROUNDS * (len(space) + 1) + WALK_COST, 2 * residuals.left // 3)
     tried: list[Tensor] = []
     ends: list[tuple[float, Tensor]] = []
     steps = 0
     for candidate in candidates:
         exhausted = len(tried) == STARTS or (tried and residuals.left < reserve + 3 * (len(space) + 1))
-        if exhausted or residuals.rmse < PERFECT or _found_twice(ends):
+        if exhausted or residuals.least < PERFECT or _found_twice(ends):
             break
         if any(float((candidate - other).norm()) < APART for other in tried):
             continue
         tried.append(candidate)
-        descent = _Descent(residuals, space, reserve)
-        steps += descent.run(candidate)
-        ends.append((descent.least, descent.at))
+        descent = _Descent(residuals, space, reserve, solver)
+        with _next_batch(residuals, batches):
+            steps += descent.run(candidate)
+        least = descent.least if batches is None or not residuals.left else float(residuals.value(descent.at).norm())
+        ends.append((least, descent.at))
     walk_radius(residuals, space)
     refined, converged = polish(residuals, space)
     return Outcome(len(tried), steps + refined, converged)
+
+
+@contextmanager
+def _next_batch(residuals: Residuals, batches: Iterator[list[int]] | None) -> Iterator[None]:
+    if batches is None:
+        yield
+    else:
+        with residuals.batch(next(batches)):
+            yield
 
 
 def walk_radius(residuals: Residuals, space: ParameterSpace) -> None:
     """Evaluate radii outward from the best point on both sides, each with the contrast that suits it best; then again, closer.
 
     Radius and contrast trade off, so the error has a long valley, and regular scenes (columns, windows) put ripples on its floor:
-    a descent ends in the nearest. Skipped unless the radius is fitted and the budget pays for all points.
+    a descent ends in the nearest. Skipped unless the radius is fitted for all scenes together and the budget pays for all points.
     Cost: the sum of `WALKS`.
     """
-    if "radius" not in space.names or residuals.left < WALK_COST or residuals.rmse < PERFECT:
+    at = space.column("radius")
+    if at is None or residuals.left < WALK_COST or residuals.least < PERFECT:
         return
-    at = space.names.index("radius")
     for count, spacing in WALKS:
         if residuals.best_log is None:
             return
@@ -101,17 +126,18 @@ def _found_twice(ends: list[tuple[float, Tensor]]) -> bool:
 
 @final
 class _Descent:
-    """One Levenberg-Marquardt run: what optimistix visits, and when it is told to stop."""
+    """One run of a solver: what optimistix visits, and when it is told to stop."""
 
-    def __init__(self, residuals: Residuals, space: ParameterSpace, reserve: int) -> None:
-        self.residuals, self.space, self.reserve = residuals, space, reserve
+    def __init__(self, residuals: Residuals, space: ParameterSpace, reserve: int, solver: str) -> None:
+        self.residuals, self.space, self.solver = residuals, space, solver
+        self.reserve = reserve
         self.least, self.at = math.inf, space.start
         self.scale = 0.0
         self.stalled = 0
         self.steps = -1  # the first visit is no step
 
     def run(self, start: Tensor) -> int:
-        bridge.levenberg_marquardt(self._visit, self.space.from_log(start).numpy())
+        bridge.solve(self.solver, self._visit, self.space.from_log(start).numpy())
         return max(self.steps, 0)
 
     def _visit(self, at: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -141,7 +167,8 @@ class _Descent:
     def _reduce(self, residual: Tensor, jacobian: Tensor) -> NDArray[np.float64]:
         if not self.scale:  # optimistix starts with a damping of 1: scaled, that is FIRST_DAMPING of J'J
             largest = float(jacobian.square().sum(0).max())
-            self.scale = 1 / math.sqrt(max(FIRST_DAMPING * largest, 1e-30))
+            unit = FIRST_CURVATURE if self.solver == "bfgs" else FIRST_DAMPING
+            self.scale = 1 / math.sqrt(max(unit * largest, 1e-30))
         stacked = torch.cat((jacobian, residual[:, None]), 1)
         stacked = torch.nn.functional.pad(stacked, (0, 0, 0, max(0, stacked.shape[1] - len(stacked))))
         upper = torch.linalg.qr(stacked, mode="r").R

@@ -25,6 +25,14 @@ def covariance(jacobian: Tensor, noise: Tensor) -> Tensor:
     return inverse @ (spread.T @ spread) @ inverse
 
 
+def correlation(covariance: Tensor) -> Tensor:
+    """(P, P) correlations of a covariance; nan in the rows and columns of parameters without variance."""
+    deviation = covariance.diagonal().clamp(min=0).sqrt()
+    known = deviation > 0
+    scaled = covariance / torch.where(known, deviation, 1.0)[:, None] / torch.where(known, deviation, 1.0)
+    return torch.where(known[:, None] & known, scaled.clamp(-1, 1), torch.nan)
+
+
 def undetermined(jacobian: Tensor, space: ParameterSpace, log: Tensor) -> tuple[str, ...]:
     """Names of the parameters that lie in a flat direction of the error or at a bound.
 

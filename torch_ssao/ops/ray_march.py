@@ -221,7 +221,6 @@ class _March(NamedTuple):
     ) -> list[Tensor]:
         inputs = _inputs(tensors, self.spec)
         stored = _stored(inputs.planes, inputs.pyramid)
-        per_ray = grad / outputs[1]
         totals = [None if t is None else torch.zeros_like(t) for t in inputs[:5]]
         to_stored = torch.zeros_like(stored)
         flat = to_stored.view(-1, stored.shape[2] * 4)
@@ -229,7 +228,7 @@ class _March(NamedTuple):
             at = rays[0].images, rays[0].pixels
             for block in rays:
                 piece = _Piece(self, block, inputs, stored)
-                *parts, rows = pull_back(piece.visibility, piece.leaves, [per_ray[at]])
+                *parts, rows = pull_back(piece.visibility, piece.leaves, [grad[at] / outputs[1][at]])
                 targets = [target for target in block.cut(totals) if target is not None]
                 for target, part in zip(targets, parts, strict=True):
                     target += part
