@@ -4,8 +4,8 @@
 
 The built-in temple and street, and sibenik.ply and sponza_crytek.ply of FOLDER (with its scenes.json) where there are any.
 Every technique is fitted on view 0, at half the size, and judged on all other views; all noisy ones have the same filter, one
-pass. Rows go to benchmarks/results/paper_tables.json beside those of other scenes, tables to stdout, pictures (reference, image, difference) and cached
-references to out/paper_tables. --show prints the tables of the stored rows, and measures nothing.
+pass. Rows go to benchmarks/results/paper_tables.json beside those of other scenes, tables to stdout, pictures (reference, image,
+difference) and cached references to out/paper_tables. --show prints the tables of the stored rows, and measures nothing.
 """
 
 from __future__ import annotations
