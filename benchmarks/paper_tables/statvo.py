@@ -134,7 +134,26 @@ def _statvo_limit(case: Case, module: AmbientVisibility) -> Tensor:
 
 
 def table(found: list[dict[str, Any]]) -> str:
-    """Markdown."""
+    """Markdown: RMSE at the longest StatVO's time, then everything."""
+    return f"{_summary(found)}\n\n{_everything(found)}"
+
+
+def _summary(found: list[dict[str, Any]]) -> str:
+    longest = list(STATVO)[-1]
+    scenes = list(dict.fromkeys(row["scene"] for row in found))
+    lines = ["| RMSE | " + " | ".join(scenes) + " |", "|---|" + "---|" * len(scenes)]
+    for label in [*STATVO, *(f"{name}, as long as {longest}" for name in PEERS), "constant"]:
+        name, _, suffix = label.partition(", as")
+        cells = [
+            f"{row['rmse']:.4f}"
+            for row in found
+            if row["technique"].startswith(name) and row["technique"].endswith(suffix)
+        ]
+        lines.append(f"| {label} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _everything(found: list[dict[str, Any]]) -> str:
     lines = [
         "| scene | technique | ms, median [quartiles] | RMSE | PSNR | SSIM | RMSE, SSIM to its own limit | RMSE of that limit |",
         "|---|---|---|---|---|---|---|---|",

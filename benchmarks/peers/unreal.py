@@ -32,7 +32,7 @@ class UnrealAngle(AmbientVisibility):
         radius: of the disk of taps, scene units.
         strength: of the obscurance.
         halo: of the radius: taps that far away have no weight.
-        pairs: of opposite taps; 3 were shipped at half size, 6 by the account.
+        pairs: of opposite taps; 6 by the account.
         contrast, denoise: of this library; 1 and 0 leave the rest.
     Gradients: to all parameters; in the radius not through which pixels are read.
     Raises: ShapeError in forward for a G-buffer without normals.

@@ -65,6 +65,22 @@ def test_counts_of_equal_time_solve_what_a_sample_costs(case: common.Case, monke
     assert counts == {"point sampling": [20], "line sampling": [40], "SAO": [80]}
 
 
+def test_statvo_beside_its_peers(case: common.Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(statvo, "LIMIT", 64)
+    monkeypatch.setattr(statvo, "equal_counts", lambda case, modules: {name: [20, 30, 40] for name in statvo.PEERS})
+    found = statvo.rows(case)
+    rows = {row["technique"]: row for row in found}
+    assert len(rows) == 3 + 3 * 4 + 1
+    for name, count in (("point sampling", 17), ("line sampling", 12), ("SAO", 11)):
+        few, many = rows[f"{name}, {count}: the paper's count"], rows[f"{name}, 40: as long as StatVO, quadrants"]
+        assert (few["samples"], many["samples"]) == (count, 40)
+        assert few["values"] == many["values"]  # one fit
+        assert few["limit_to_reference"] == many["limit_to_reference"]
+    limits = {name: rows[name]["limit"]["rmse"] for name in statvo.STATVO}
+    assert all(0 < value < 0.2 for value in limits.values())
+    assert statvo.table(found).count("| temple |") == len(rows) + 1  # and the head of the summary
+
+
 def test_the_ceiling_takes_the_reference_share_of_the_noise(case: common.Case) -> None:
     image = case.traced()
     assert len(case.traced_ms) == 2
