@@ -151,7 +151,9 @@ def tensor_bytes(tensor: Tensor | None) -> bytes:
     """Dtype, shape and bytes of a tensor, for hashes."""
     if tensor is None:
         return b"none"
-    plain = tensor.detach().cpu().contiguous()
+    plain = (
+        tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
+    )  # one that is expanded cannot be viewed as bytes
     content = plain.reshape(-1).view(torch.uint8).numpy().tobytes() if plain.numel() else b""
     return f"{plain.dtype} {tuple(plain.shape)} ".encode() + content
 
