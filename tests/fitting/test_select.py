@@ -29,12 +29,11 @@ def smooth() -> tuple[ts.GBuffer, torch.Tensor]:
     return gbuffer, dense_rays(gbuffer)
 
 
-GRID = {"layers": [1, 2, 4]}
-FAST = {"max_evaluations": 80}
+FAST = {"max_evaluations": 60}
 
 
 def test_a_scene_without_depth_discontinuities_gets_one_layer(smooth: Any) -> None:
-    choice = select(candidates.statvo(0.5, **GRID), *smooth, timer=price_list, fit_options=FAST)
+    choice = select(candidates.statvo(0.5, layers=[1, 2, 4]), *smooth, timer=price_list, fit_options=FAST)
     assert choice.best.module.layers == 1
     assert choice.reached
     assert not choice.judged_on_training_views
@@ -45,7 +44,7 @@ def test_the_temple_gets_more_than_one_layer() -> None:
     size = {"height": 48, "width": 64}
     gbuffer = ts.scenes.render(scene, **size)
     truth = ts.reference.raytrace(scene, **size, samples=64, progress=False)
-    choice = select(candidates.statvo(scene.radius, **GRID), gbuffer, truth, timer=price_list, fit_options=FAST)
+    choice = select(candidates.statvo(scene.radius, layers=[1, 4]), gbuffer, truth, timer=price_list, fit_options=FAST)
     assert choice.best.module.layers > 1
     rows = {row.name: row for row in choice.table}
     assert rows["statvo_layers1"].validation_rmse > 1.1 * choice.best.validation_rmse

@@ -84,10 +84,11 @@ def select(
                 bar.update(row.name)
 
             rows = fit_chain(chosen, problem, plan, store, finished)
-        rows = timed(rows, problem, timer)
+        rows = timed(rows, problem.validation[0].gbuffer, timer)
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(interrupted(len(done), len(chosen), "candidates", store)) from error
-    return choice_of(rows, problem, target_rmse, budget_ms, (*problem.notes, *store.notes))
+    on_training, notes = problem.judged_on_training_views, (*problem.notes, *store.notes)
+    return choice_of(rows, target_rmse, budget_ms, on_training=on_training, notes=notes)
 
 
 def check_wishes(target_rmse: float | None, budget_ms: float | None) -> None:
@@ -97,9 +98,8 @@ def check_wishes(target_rmse: float | None, budget_ms: float | None) -> None:
             checks.check_positive(name, value)
 
 
-def timed(rows: Sequence[Row], problem: Problem, timer: Timer) -> list[Row]:
-    """The rows with timings on the first judged view; one that fails there gets an `error`."""
-    view = problem.validation[0].gbuffer
+def timed(rows: Sequence[Row], view: GBuffer, timer: Timer) -> list[Row]:
+    """The rows with timings of one view; one that fails there gets an `error`."""
     alive = [row for row in rows if row.error is None]
     found: dict[str, Timing | Exception] = {}
     try:
@@ -116,9 +116,10 @@ def timed(rows: Sequence[Row], problem: Problem, timer: Timer) -> list[Row]:
 
 def choice_of(
     rows: Sequence[Row],
-    problem: Problem,
     target_rmse: float | None,
     budget_ms: float | None,
+    *,
+    on_training: bool,
     notes: tuple[str, ...],
 ) -> Choice:
     """The choice among timed rows.
@@ -131,7 +132,6 @@ def choice_of(
             f"candidates must hold one that can be fitted, got {len(rows)} that fail, {first.name} with {first.error}: mend or "
             f"replace them"
         )
-    on_training = problem.judged_on_training_views
     judged = "RMSE on its training view" if on_training else "validation RMSE"
     decision = decide(rows, target_rmse=target_rmse, budget_ms=budget_ms, judged=judged)
     if on_training:

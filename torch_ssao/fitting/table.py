@@ -84,9 +84,13 @@ class Row:
 
 def failed(name: str, module: AmbientVisibility, error: BaseException) -> Row:
     """The row of a candidate that raised `error`."""
+    return Row(name, module, math.nan, math.nan, (), {}, {}, (), 0, 0.0, "", error=one_line(error))
+
+
+def one_line(error: BaseException) -> str:
+    """The kind of an error and the first line of what it says."""
     lines = str(error).strip().splitlines()
-    text = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
-    return Row(name, module, math.nan, math.nan, (), {}, {}, (), 0, 0.0, "", error=text)
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
 @final
