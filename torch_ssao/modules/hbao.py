@@ -152,9 +152,9 @@ class HBAO(AmbientVisibility):
 
         Args:
             gbuffer, frame: as for `forward`.
-        Returns: (B, 1, H, W) visibility, that of `forward` (at full resolution in any case); and (B, 3, H, W) unit directions in view space, cosine-weighted with
-            weighting "cosine", all alike with "uniform": the normal where nothing is occluded or nothing is open, (0, 0, -1) at
-            invalid pixels. The denoiser and the contrast leave them as they are.
+        Returns: (B, 1, H, W) visibility, that of `forward` at full resolution; and (B, 3, H, W) unit directions in view space,
+            cosine-weighted with weighting "cosine", all alike with "uniform": the normal where nothing is occluded or nothing
+            is open, (0, 0, -1) at invalid pixels. The denoiser and the contrast leave them as they are.
         Gradients: to depth, normal, camera and the module's parameters.
         """
         if gbuffer.depth.ndim == 3:  # inside vmap
