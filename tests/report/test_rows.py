@@ -7,6 +7,7 @@ import torch
 
 from support.reports import SIZE, corner
 from torch_ssao import StatVO, checks, metrics, scenes
+from torch_ssao.fitting.timing import summary
 from torch_ssao.report import rows
 from torch_ssao.report.truth import Truth
 
@@ -58,7 +59,7 @@ def test_timing_is_ordered_and_counts() -> None:
 
 
 def test_quartiles() -> None:
-    found = rows._summary([5.0, 1.0, 2.0, 4.0, 3.0])
+    found = summary([5.0, 1.0, 2.0, 4.0, 3.0])
     assert (found.low_ms, found.median_ms, found.high_ms) == (2.0, 3.0, 4.0)
 
 

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
 import torch
 from torch import Tensor
 
-from torch_ssao import checks, metrics
+from torch_ssao import metrics
+from torch_ssao.fitting.timing import REPEATS as REPEATS
+from torch_ssao.fitting.timing import Timing as Timing
+from torch_ssao.fitting.timing import time_forward as time_forward
 from torch_ssao.gbuffer import GBuffer
 from torch_ssao.modules import TECHNIQUES, AmbientVisibility
 from torch_ssao.report.truth import Truth
-
-REPEATS = 7
-"""Timed forward passes per module, after one that is not timed; at least 5, so that quartiles mean something."""
 
 
 @final
@@ -28,17 +26,6 @@ class Score:
     rmse: float
     psnr: float
     ssim: float
-
-
-@final
-@dataclass(frozen=True)
-class Timing:
-    """Milliseconds of one forward pass over one view without gradients: median and quartiles of `repeats`."""
-
-    median_ms: float
-    low_ms: float
-    high_ms: float
-    repeats: int
 
 
 @final
@@ -124,42 +111,6 @@ def score_constant(value: float, truth: Truth) -> Score:
 def best_constant(truth: Truth) -> float:
     """The constant of least RMSE: the mean visibility of the valid pixels."""
     return float(truth.visibility[truth.valid].double().mean())
-
-
-def time_forward(modules: Sequence[AmbientVisibility], gbuffer: GBuffer, *, repeats: int = REPEATS) -> list[Timing]:
-    """Milliseconds of one forward pass of each module without gradients.
-
-    Args:
-        modules: what to time. They take turns, so that a machine that slows down slows all of them.
-        gbuffer: one view.
-        repeats: timed passes a module, at least 5.
-    Raises: RangeError for fewer than 5 repeats.
-    """
-    checks.check_count("repeats", repeats, 5)
-    milliseconds: list[list[float]] = [[] for _ in modules]
-    with torch.no_grad():
-        for module in modules:
-            module(gbuffer)  # the first pass allocates and, on a GPU, loads kernels
-        for _ in range(repeats):
-            for module, taken in zip(modules, milliseconds, strict=True):
-                _wait(gbuffer)
-                start = time.perf_counter()
-                module(gbuffer)
-                _wait(gbuffer)
-                taken.append(1e3 * (time.perf_counter() - start))
-    return [_summary(taken) for taken in milliseconds]
-
-
-def _summary(taken: list[float]) -> Timing:
-    low, median, high = (
-        torch.tensor(taken, dtype=torch.float64).quantile(torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)).tolist()
-    )
-    return Timing(median, low, high, len(taken))
-
-
-def _wait(gbuffer: GBuffer) -> None:
-    if gbuffer.depth.is_cuda:
-        torch.cuda.synchronize(gbuffer.depth.device)
 
 
 def plain(value: Any) -> Any:
