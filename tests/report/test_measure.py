@@ -8,15 +8,15 @@ import pytest
 import torch
 
 import torch_ssao as ts
-from support.reports import TINY, corner, fake_fit
-from torch_ssao import checks, fitting, load, reference, scenes
+from support.reports import TINY, corner, fake_fit, quick_fits
+from torch_ssao import checks, load, reference, scenes
 from torch_ssao.report import Measurement, measure
 from torch_ssao.report.rows import predict, score
 
 
 @pytest.fixture(autouse=True)
 def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "fit", fake_fit, raising=False)
+    quick_fits(monkeypatch)
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def no_tracing(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Measurement:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fitting, "fit", fake_fit, raising=False)
+        quick_fits(patch)
         return measure(corner(views=3), tmp_path_factory.mktemp("out"), **TINY)
 
 
@@ -166,7 +166,7 @@ def test_what_was_finished_stays_after_an_interruption(tmp_path: Path, monkeypat
             raise KeyboardInterrupt
         return fake_fit(module, *arguments, **options)
 
-    monkeypatch.setattr(fitting, "fit", interrupted, raising=False)
+    monkeypatch.setattr("torch_ssao.fitting.chain.fit", interrupted)
     with pytest.raises(KeyboardInterrupt):
         measure(corner(), tmp_path, **TINY)
     assert load(tmp_path / "statvo_1.json").layers == 1
