@@ -294,7 +294,7 @@ def _fit_all(plan: _Plan, data: _Data) -> tuple[dict[str, Fitted], Chosen]:
     options: dict[str, Any] = {"parameters": plan.parameters, "progress": plan.progress}
     if plan.max_evaluations is not None:
         options["fit_options"] = {"max_evaluations": plan.max_evaluations}
-    plan.note(f"fitting and timing {len(modules)} models")
+    plan.note(f"fitting and timing {', '.join(modules)}")
     fits, chosen = fit_and_choose(
         modules,
         data.gbuffer,

@@ -83,7 +83,7 @@ def _draw_peers(axes: Any, measurement: Measurement) -> None:
             "textcoords": "offset points",
             "zorder": 4,
         }
-        axes.annotate(name, (timing.median_ms, error), xytext=(0, 9), **label)
+        axes.annotate(name, (timing.median_ms, error), xytext=(8, 0), **label)
 
 
 def _draw_front(axes: Any, measurement: Measurement) -> None:

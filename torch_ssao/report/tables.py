@@ -104,9 +104,15 @@ def _ceiling(ceiling: Ceiling) -> list[str]:
 def _timing(timing: Timing | None) -> str:
     if timing is None:
         return "-"
-    if not timing.repeats:  # a peer's, whose file says no quartiles
-        return f"{timing.median_ms:.1f}"
-    return f"{timing.median_ms:.1f} ({timing.low_ms:.1f}-{timing.high_ms:.1f})"
+    low, median, high = map(milliseconds, (timing.low_ms, timing.median_ms, timing.high_ms))
+    return (
+        median if timing.low_ms == timing.high_ms else f"{median} ({low}-{high})"
+    )  # a peer may come without quartiles
+
+
+def milliseconds(value: float) -> str:
+    """Three digits where there are that many before the point or after it: 0.0213, 8.92, 72.5, 1234.5."""
+    return f"{value:.1f}" if value >= 10 else f"{value:.3g}"
 
 
 def _uncertainty(row: Row, name: str) -> str:
