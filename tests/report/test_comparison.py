@@ -14,7 +14,7 @@ import pytest
 
 from support.reports import TINY, corner, quick_fits
 from torch_ssao.report import Measurement, html, make_report, plots, spreadsheet, tables
-from torch_ssao.report.pareto import entries, is_on, pareto_front
+from torch_ssao.report.pareto import entries, pareto_front
 from torch_ssao.report.peers import Peer
 from torch_ssao.report.rows import Score, Timing
 

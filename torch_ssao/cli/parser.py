@@ -111,7 +111,8 @@ def _add_measure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--peers", type=Path, metavar="FILE", help=peers)
     note = (
         "One fit for each count; counts of a pair are taken together, --slices 3,4 --steps 4,8 is 3x4 and 4x8.\n"
-        "Left out: 1, 2, 4 and 8 layers; 2x4 and 3x6 slices and steps; 16x8 rays and steps."
+        "Left out: 1, 2, 4 and 8 layers; 2x4 and 3x6 slices and steps; 16x8 rays and steps. With a target or a budget,\n"
+        "1x4, 2x4, 2x6, 3x6 and 4x8 slices and steps; 4x4, 8x4, 8x8 and 16x8 rays and steps."
     )
     techniques.add_options(parser, _numbers, "N,N", note)
 

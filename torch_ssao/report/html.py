@@ -145,7 +145,10 @@ def _front(measurement: Measurement) -> str:
     mark, front = tables.ON_FRONT, pareto_front(measurement)
     peers = [escape(peer.name) for peer in measurement.peers if is_on(front, peer)]
     theirs = f" Peers on it: {', '.join(peers)}." if peers else ""
-    return f"{mark}: on the Pareto front, that is, none of these {len(entries(measurement))} is both faster and nearer.{theirs}"
+    return (
+        f"{mark}: on the Pareto front: none of these {len(entries(measurement))} is both faster and nearer (a model untuned and "
+        f"fitted does the same work: the better of the two competes).{theirs}"
+    )
 
 
 def _peer_notes(measurement: Measurement) -> str:

@@ -161,7 +161,7 @@ def measure(
         repeats: timed forward passes per module, at least 5.
         seed: of the reference's sampling pattern.
         target_rmse, budget_ms: what the chosen module has to reach, error on the judged views and milliseconds a view; see
-            `fitting.select`, also for what is chosen without.
+            `fitting.select`, also for what is chosen without. With either, counts that are left out are swept more finely.
         peers: JSON file with results of other implementations on this scene and size; see `peers.load_peers`.
         progress: bars and notes on stderr; None shows them on a terminal only.
     Returns: a `Measurement`; its errors are of the judged views first and of the fitted views second.
@@ -172,7 +172,8 @@ def measure(
     require("measure", "scenes", "trimesh", "embreex")  # before any work: without the extras nothing should be traced
     require("measure", "fitting", "optimistix")
     settings = TraceSettings(height, width, scene.radius if radius is None else radius, samples, seed)
-    modules = candidates(technique, settings.radius, layers, options)
+    fine = target_rmse is not None or budget_ms is not None
+    modules = candidates(technique, settings.radius, layers, options, fine=fine)
     fit_on, judged = _split_views(scene, views, fit_views)
     wish = Wish(target_rmse, budget_ms)
     _check_arguments(settings, repeats, wish)
