@@ -267,10 +267,11 @@ class _March(NamedTuple):
         return total
 
     def blocks(self, inputs: _Inputs, *, derivative: bool = False) -> Iterator[list[_Block]]:
-        """Those of the same pixels together: they differ in their rays. A derivative records them: half as many at once."""
+        """Those of the same pixels together: they differ in their rays. Derivatives record them: fewer at once."""
         batch, count = inputs.reach.shape
         taps = _TAPS_AT_ONCE.get(inputs.reach.device.type, 2**17)
-        budget = max(1, taps // (2 * self.spec.steps if derivative else self.spec.steps))
+        share = (2 if self.spec.gradient == "exact" else 8) if derivative else 1  # the others record every step
+        budget = max(1, taps // (share * self.spec.steps))
         pixels = min(count, budget)
         images = min(batch, max(1, budget // count))
         rays = min(len(self.disk), max(1, budget // (pixels * images)))
