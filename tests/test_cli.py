@@ -14,8 +14,8 @@ import pytest
 from PIL import Image
 
 import torch_ssao as ts
-from support.reports import corner, fake_fit
-from torch_ssao import cli, fitting, reference, scenes
+from support.reports import corner, quick_fits
+from torch_ssao import cli, reference, scenes
 from torch_ssao.cli import commands, parser
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(ts.__file__).parents[1])}  # found from any folder, installed or not
@@ -29,7 +29,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "fit", fake_fit, raising=False)
+    quick_fits(monkeypatch)
 
 
 @pytest.fixture
@@ -324,7 +324,7 @@ def test_ctrl_c_is_one_line_and_keeps_finished_files(
 
     monkeypatch.setattr(scenes, "render", interrupted)
     assert cli.main(["render", "temple", *TINY, "--out", "o"]) == 130
-    assert capsys.readouterr().err == "torch-ssao: interrupted\n"
+    assert capsys.readouterr().err == "torch-ssao: interrupted: the same command goes on with what was finished\n"
     assert [file.name for file in Path("o").iterdir()] == ["visibility_0.png"]
 
 

@@ -215,6 +215,15 @@ class Camera:
 
     # ---- batch and device --------------------------------------------------------------------------------------
 
+    def halved(self) -> Camera:
+        """The camera of the pixels of even rows and columns, as `depth[..., ::2, ::2]` has them.
+
+        Returns: a Camera of ceil(height / 2) x ceil(width / 2) pixels through the same rays: fx / 2, cx / 2 + 0.25.
+        """
+        intrinsics = (self.fx / 2, self.fy / 2, self.cx / 2 + 0.25, self.cy / 2 + 0.25)
+        size = ((self.height + 1) // 2, (self.width + 1) // 2)
+        return Camera(*intrinsics, *size, world_to_view=self.world_to_view, is_orthographic=self.is_orthographic)
+
     def expand(self, batch: int) -> Camera:
         """The same camera for `batch` images; a batch of one is repeated as a view."""
         if len(self) == batch:

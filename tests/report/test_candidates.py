@@ -87,3 +87,12 @@ def test_every_technique_has_a_title_and_counts_that_exist() -> None:
 def test_options_that_cannot_be(technique: Any, options: dict[str, Any], error: type[ValueError], message: str) -> None:
     with pytest.raises(error, match=message):
         candidates(technique, 0.5, (1,), options)
+
+
+def test_fine_sweeps_are_for_counts_that_are_left_out() -> None:
+    def names(**given: int) -> list[str]:
+        return [name for name, *_ in candidates(("statvo", "hbao", "ray_march"), 0.5, (1, 2), given, fine=True)]
+
+    hbao, rays = ["hbao_1x4", "hbao_2x4", "hbao_2x6", "hbao_3x6", "hbao_4x8"], ["4x4", "8x4", "8x8", "16x8"]
+    assert names() == ["statvo_1", "statvo_2", *hbao, *(f"ray_march_{counts}" for counts in rays)]
+    assert names(slices=2, steps=3, rays=5) == ["statvo_1", "statvo_2", "hbao_2x3", "ray_march_5x3"]

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from support.reports import TINY, corner, fake_fit
-from torch_ssao import checks, fitting
+from support.reports import TINY, corner, quick_fits
+from torch_ssao import checks
 from torch_ssao.modules import TECHNIQUES
 from torch_ssao.report import Measurement, html, make_report, overview, plots, tables
 from torch_ssao.report import make as make_module
@@ -28,7 +28,7 @@ NASTY = 'corner <b>&"'
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Measurement:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fitting, "fit", fake_fit, raising=False)
+        quick_fits(patch)
         return make_report(corner(NASTY), tmp_path_factory.mktemp("out"), **TINY)
 
 
@@ -36,7 +36,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Measurement:
 def compared(tmp_path_factory: pytest.TempPathFactory) -> Measurement:
     """Three techniques in one report."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fitting, "fit", fake_fit, raising=False)
+        quick_fits(patch)
         options = {"technique": tuple(TECHNIQUES), "options": {"layers": (1, 2), "rays": 2, "slices": 2, "steps": 2}}
         return make_report(corner(), tmp_path_factory.mktemp("compared"), **TINY, **options)
 
@@ -46,8 +46,14 @@ def page(made: Measurement) -> str:
     return (made.out / "report.html").read_text(encoding="utf-8")
 
 
+def shown_on_the_page(measurement: Measurement) -> list[str]:
+    """The chosen module's pictures are there under its row's name."""
+    return [name for name in measurement.files if name.endswith(".png") and not name.startswith("chosen_")]
+
+
 def test_all_files_are_there_and_listed(made: Measurement) -> None:
-    expected = {"report.html", "report.json", "speed_error.png", "fitted_values.png", "reference.png"}
+    expected = {"report.html", "report.json", "report.csv", "speed_error.png", "fitted_values.png", "reference.png"}
+    expected |= {"chosen.json", "chosen_1.png"}
     for name in ("statvo_1", "statvo_2"):
         expected |= {f"{name}.json"}
         expected |= {f"{name}_{state}{kind}.png" for state in ("untuned", "fitted") for kind in ("", "_error")}
@@ -71,12 +77,15 @@ def test_the_page_loads_nothing_from_elsewhere(page: str) -> None:
     for source in sources:
         assert source.startswith("data:image/png;base64,")
         Image.open(io.BytesIO(base64.b64decode(source.partition(",")[2]))).verify()
+    keys = re.findall(r'<img id="([^"]*)"', page)
+    assert len(set(keys)) == len(keys) == len(sources) == page.count("data:image")  # each picture once
     rest = re.sub(r'src="[^"]*"', "", page)
-    assert not re.search(r"https?:|url\(|@import|<script|<link|href=", rest)
+    assert not re.search(r"https?:|url\(|@import|<script[^>]|<link|href=", rest)
+    assert "default-src 'none'" in rest
 
 
 def test_the_page_shows_every_picture_and_row(made: Measurement, page: str) -> None:
-    assert len(re.findall("<img", page)) == sum(name.endswith(".png") for name in made.files)
+    assert len(re.findall("<img", page)) == len(shown_on_the_page(made))
     for row in made.rows:
         assert f"{row.validation.rmse:.4f}" in page
     assert "noise ceiling" in page
@@ -116,7 +125,7 @@ def test_table_cells(made: Measurement) -> None:
     titles = [line[0] for line in cells]
     assert titles[:4] == ["1 layer, untuned", "2 layers, untuned", "1 layer, fitted", "2 layers, fitted"]
     assert titles[-1] == "noise ceiling"
-    assert all(len(line) == len(tables.COLUMNS) for line in cells)
+    assert all(len(line) == len(tables.columns(made)) for line in cells)
     by_parameter = {(line[0], line[1]): line[3] for line in tables.value_cells(made)}
     assert by_parameter["1 layer", "radius"] == "± 0.01"
     assert by_parameter["1 layer", "falloff"] == tables.UNDETERMINED
@@ -127,7 +136,7 @@ def test_table_cells(made: Measurement) -> None:
 
 def test_several_techniques_share_one_page(compared: Measurement) -> None:
     page = (compared.out / "report.html").read_text(encoding="utf-8")
-    assert len(re.findall("<img", page)) == sum(name.endswith(".png") for name in compared.files)
+    assert len(re.findall("<img", page)) == len(shown_on_the_page(compared))
     assert "techniques.png" in compared.files
     for text in ("StatVO 2 layers", "HBAO 2x2", "ray march 2x2", "slices 2", "rays 2"):
         assert text in page, text

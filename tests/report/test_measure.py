@@ -8,15 +8,15 @@ import pytest
 import torch
 
 import torch_ssao as ts
-from support.reports import TINY, corner, fake_fit
-from torch_ssao import checks, fitting, load, reference, scenes
+from support.reports import TINY, corner, fake_fit, quick_fits
+from torch_ssao import checks, load, reference, scenes
 from torch_ssao.report import Measurement, measure
 from torch_ssao.report.rows import predict, score
 
 
 @pytest.fixture(autouse=True)
 def quick_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "fit", fake_fit, raising=False)
+    quick_fits(monkeypatch)
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def no_tracing(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Measurement:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fitting, "fit", fake_fit, raising=False)
+        quick_fits(patch)
         return measure(corner(views=3), tmp_path_factory.mktemp("out"), **TINY)
 
 
@@ -142,6 +142,9 @@ def test_several_techniques_are_measured_on_the_same_views(tmp_path: Path) -> No
         ({"radius": 0.0}, checks.RangeError, "radius must be finite and greater than 0"),
         ({"repeats": 3}, checks.RangeError, "repeats must be a whole number at least 5"),
         ({"samples": 0}, checks.RangeError, "samples"),
+        ({"target_rmse": 0.0}, checks.RangeError, "target_rmse must be finite and greater than 0"),
+        ({"budget_ms": -1.0}, checks.RangeError, "budget_ms must be finite and greater than 0"),
+        ({"peers": "none.json"}, checks.SceneError, "peers file 'none.json' does not exist"),
     ],
 )
 @pytest.mark.usefixtures("no_tracing")
@@ -158,25 +161,102 @@ def test_an_output_folder_that_cannot_be_written_is_told_before_any_work(tmp_pat
     (tmp_path / "file").write_text("")
     with pytest.raises(checks.OutputError, match=r"out .* is not writable"):
         measure(corner(), tmp_path / "file" / "out", **TINY)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "fits").write_text("")
+    with pytest.raises(checks.OutputError, match=r"out .*fits' is not writable"):
+        measure(corner(), tmp_path / "out", **TINY)
 
 
-def test_what_was_finished_stays_after_an_interruption(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(module: Any, *arguments: Any, **options: Any) -> Any:
-        if module.layers == 2:
+def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted, traced = [], []
+    interrupts = [True]
+    real = reference.raytrace
+
+    def fit(module: Any, *arguments: Any, **options: Any) -> Any:
+        if module.layers == 2 and interrupts:
+            interrupts.pop()
             raise KeyboardInterrupt
+        fitted.append(module.layers)
         return fake_fit(module, *arguments, **options)
 
-    monkeypatch.setattr(fitting, "fit", interrupted, raising=False)
-    with pytest.raises(KeyboardInterrupt):
+    def trace(*arguments: Any, **options: Any) -> Any:
+        traced.append(options["views"])
+        return real(*arguments, **options)
+
+    monkeypatch.setattr("torch_ssao.fitting.chain.fit", fit)
+    monkeypatch.setattr(reference, "raytrace", trace)
+    with pytest.raises(KeyboardInterrupt, match="Interrupted after 1 of 2 candidates; those done are kept"):
         measure(corner(), tmp_path, **TINY)
-    assert load(tmp_path / "statvo_1.json").layers == 1
-    assert len(list(tmp_path.glob("reference_*.npz"))) == 3
+    assert len(list((tmp_path / "fits").glob("statvo_1_*.json"))) == 1
+    assert len(list(tmp_path.glob("reference_*.npz"))) == len(traced) == 3
     assert not (tmp_path / "report.json").exists()
-    assert not list(tmp_path.glob(".*"))
+    again = measure(corner(), tmp_path, **TINY)
+    assert (fitted, len(traced)) == ([1, 2], 3)  # nothing twice
+    assert not list(tmp_path.rglob(".*"))
+    fresh = measure(corner(), tmp_path / "fresh", **TINY)
+    for row, other in zip(again.rows, fresh.rows, strict=True):
+        assert (row.module.values(), row.validation) == (other.module.values(), other.validation)
+
+
+def test_a_damaged_fit_is_made_again(tmp_path: Path) -> None:
+    first = measure(corner(), tmp_path, **TINY)
+    for path in (tmp_path / "fits").iterdir():
+        path.write_text(path.read_text()[:200])
+    again = measure(corner(), tmp_path, **TINY)
+    assert [row.validation for row in again.rows] == [row.validation for row in first.rows]
+
+
+def test_the_chosen_module_is_saved_and_explained(tmp_path: Path) -> None:
+    measured = measure(corner(), tmp_path, **TINY, target_rmse=0.9)
+    chosen = measured.chosen
+    assert chosen is not None
+    assert chosen.reached
+    assert chosen.label.startswith("StatVO, ")
+    assert "is at most 0.9" in chosen.reason
+    best = next(row for row in measured.rows if row.is_fitted and row.name == chosen.name)
+    assert load(tmp_path / "chosen.json").values() == best.module.values()
+    record = json.loads((tmp_path / "report.json").read_text())
+    assert record["chosen"]["name"] == chosen.name
+    assert record["chosen"]["target_rmse"] == 0.9
+    unreached = measure(corner(), tmp_path, **TINY, target_rmse=1e-9).chosen
+    assert unreached is not None
+    assert not unreached.reached
+    assert "No candidate reaches validation RMSE 1e-09" in unreached.reason
+
+
+def test_the_errors_of_the_choice_are_those_of_the_table(tmp_path: Path) -> None:
+    """`select` and the report judge the same pixels of the same views."""
+    options = TINY | {"views": [2, 1], "fit_views": (3,)}
+    measured = measure(corner(views=4), tmp_path, **options)
+    chosen = measured.chosen
+    assert chosen is not None
+    best = next(row for row in measured.rows if row.is_fitted and row.name == chosen.name)
+    assert f"(validation RMSE {best.validation.rmse:.5f}, training RMSE {best.training.rmse:.5f}, " in chosen.reason
+
+
+def test_a_choice_on_training_views_says_so(tmp_path: Path) -> None:
+    chosen = measure(corner(), tmp_path, **TINY | {"fit_views": (0, 1)}).chosen
+    assert chosen is not None
+    assert "validation" not in chosen.reason
+    assert "training-view RMSE" in chosen.reason
+
+
+def test_a_technique_that_fails_is_left_out_with_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(module: Any, *arguments: Any, **options: Any) -> Any:
+        if module.layers == 2:
+            raise RuntimeError("no luck\nat all")
+        return fake_fit(module, *arguments, **options)
+
+    monkeypatch.setattr("torch_ssao.fitting.chain.fit", broken)
+    measured = measure(corner(), tmp_path, **TINY)
+    assert [row.name for row in measured.rows] == ["statvo_1", "statvo_1"]
+    assert measured.chosen is not None
+    assert measured.chosen.notes == ("statvo_2 was left out: RuntimeError: no luck.",)
+    assert not (tmp_path / "statvo_2.json").exists()
 
 
 def test_notes_are_told_on_stderr_on_request(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     measure(corner(views=1), tmp_path, **TINY | {"layers": (1,)})
     assert capsys.readouterr().err == ""
     measure(corner(views=1), tmp_path, **TINY | {"layers": (1,), "progress": True})
-    assert "fitting 1 layer\ntiming\n" in capsys.readouterr().err
+    assert "fitting and timing statvo_1\n" in capsys.readouterr().err

@@ -60,17 +60,18 @@ def render_command(arguments: argparse.Namespace) -> None:
 
 
 def fit_command(arguments: argparse.Namespace) -> None:
-    """Fit techniques to a scene's ray-traced reference; print the errors before and after."""
-    from torch_ssao.report import measure
+    """Fit techniques to a scene's ray-traced reference and choose one; with a target or a budget, write the report too."""
+    from torch_ssao.report import make_report, measure
 
-    _tell(measure(**_measure_options(arguments)), "report.json")
+    has_wish = arguments.target_rmse is not None or arguments.budget_ms is not None
+    _tell((make_report if has_wish else measure)(**_measure_options(arguments)))
 
 
 def report_command(arguments: argparse.Namespace) -> None:
     """Do what fit does, and write the page with pictures."""
     from torch_ssao.report import make_report
 
-    _tell(make_report(**_measure_options(arguments)), "report.html")
+    _tell(make_report(**_measure_options(arguments)))
 
 
 # ---- what the commands share -----------------------------------------------------------------------------------------
@@ -92,11 +93,14 @@ def _measure_options(arguments: argparse.Namespace) -> dict[str, Any]:
         "radius": arguments.radius,
         "parameters": arguments.parameters,
         "max_evaluations": arguments.max_evaluations,
+        "target_rmse": arguments.target_rmse,
+        "budget_ms": arguments.budget_ms,
+        "peers": arguments.peers,
         "progress": _progress(arguments),
     }
 
 
-def _tell(measurement: Measurement, file: str) -> None:
+def _tell(measurement: Measurement) -> None:
     from torch_ssao.report import tables
 
     settings = measurement.settings
@@ -107,10 +111,15 @@ def _tell(measurement: Measurement, file: str) -> None:
     )
     if measurement.judged_on_training_views:
         print("no view was left that the fit had not seen: the errors of the fitted models flatter them")
-    print(tables.text_table(tables.COLUMNS, tables.score_cells(measurement)))
+    print(tables.text_table(tables.columns(measurement), tables.score_cells(measurement)))
     print()
     print(tables.text_table(*tables.value_matrix(measurement)))
-    print(f"\nwrote {measurement.out / file}")
+    chosen = measurement.chosen
+    if chosen is not None:
+        print(f"\n{'chosen' if chosen.reached else 'not reached; nearest'}: {chosen.label}")
+        print("\n".join((chosen.reason, *chosen.notes)))
+    files = ("chosen.json", "report.html" if "report.html" in measurement.files else "report.json")
+    print("\n" + "\n".join(f"wrote {measurement.out / file}" for file in files))
 
 
 def _scene(arguments: argparse.Namespace) -> Scene:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from typing import final
 
 _EXTRAS = {
@@ -27,6 +28,11 @@ def one_line(error: Exception) -> str:
     """The error's text in one line; a missing package with how to install it."""
     if isinstance(error, ImportError) and _extra(error):
         return f"{error.name} is not installed: run pip install 'torch_ssao[{_extra(error)}]'"
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        where = "" if error.filename is None else f" for {error.filename}"
+        return f"{error.strerror}{where}: free some, and the same command goes on with what was finished".replace(
+            "\n", " "
+        )
     return " ".join(str(error).split()) or type(error).__name__
 
 

@@ -30,10 +30,17 @@ def build() -> argparse.ArgumentParser:
     listed = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_scenes(listed)
     _add_render(listed)
-    fits = "Fit techniques to a scene's ray-traced reference and print their errors on views not used for fitting."
-    example = "torch-ssao fit bunny.ply --cameras cameras.json --layers 1,4 --fit-views 0 --out out/bunny"
+    fits = (
+        "Fit techniques to a scene's ray-traced reference, print their errors on views not used for fitting, and choose the "
+        "cheapest that is good enough: chosen.json. With a target or a budget, do what report does too. A run that was "
+        "interrupted goes on where it stopped when it is called again."
+    )
+    example = "torch-ssao fit bunny.ply --cameras cameras.json --technique all --target-rmse 0.05 --out out/bunny"
     _add_measure(_command(listed, "fit", commands.fit_command, fits, example))
-    page = "Do what fit does and write report.html: pictures, error maps, speed-against-error plot, fitted values."
+    page = (
+        "Do what fit does and write report.html: a slider over untuned, fitted and reference pictures, error maps, "
+        "speed-against-error plot, fitted values; and report.csv, report.json."
+    )
     example = "torch-ssao report temple --technique statvo,hbao --layers 1,4 --slices 3,4 --steps 4,8"
     _add_measure(_command(listed, "report", commands.report_command, page, example))
     return parser
@@ -92,9 +99,20 @@ def _add_measure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--parameters", type=_names, metavar="radius,height", help=chosen)
     budget = "budget of each fit, in forward passes; by the number of parameters if left out"
     parser.add_argument("--max-evaluations", type=int, metavar="N", help=budget)
+    target = "error on the judged views that is good enough: the cheapest model that reaches it is chosen"
+    parser.add_argument("--target-rmse", type=float, metavar="E", help=target)
+    milliseconds = (
+        "milliseconds a view that the chosen model may take; with neither, the cheapest that nearly equals the best"
+    )
+    parser.add_argument("--budget-ms", type=float, metavar="T", help=milliseconds)
+    peers = (
+        "JSON file with results of other implementations, shown beside ours: name, ms, validation: {rmse, psnr, ssim}"
+    )
+    parser.add_argument("--peers", type=Path, metavar="FILE", help=peers)
     note = (
         "One fit for each count; counts of a pair are taken together, --slices 3,4 --steps 4,8 is 3x4 and 4x8.\n"
-        "Left out: 1, 2, 4 and 8 layers; 2x4 and 3x6 slices and steps; 16x8 rays and steps."
+        "Left out: 1, 2, 4 and 8 layers; 2x4 and 3x6 slices and steps; 16x8 rays and steps. With a target or a budget,\n"
+        "1x4, 2x4, 2x6, 3x6 and 4x8 slices and steps; 4x4, 8x4, 8x8 and 16x8 rays and steps."
     )
     techniques.add_options(parser, _numbers, "N,N", note)
 

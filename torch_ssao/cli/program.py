@@ -22,8 +22,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = parser.build().parse_args(argv)
         arguments.command(arguments)
         sys.stdout.flush()  # a reader that left is noticed here, not while the interpreter ends
-    except KeyboardInterrupt:
-        print("torch-ssao: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interruption:
+        told = " ".join(str(interruption).split()) or "interrupted: the same command goes on with what was finished"
+        print(f"torch-ssao: {told}", file=sys.stderr)
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # `torch-ssao scenes | head -1`: nothing is left to tell anybody

@@ -18,6 +18,7 @@ from torch_ssao.gbuffer import GBuffer
 from torch_ssao.ops.denoise import denoise_visibility
 from torch_ssao.ops.falloff import contrast_power
 from torch_ssao.ops.normals import normals_from_points
+from torch_ssao.ops.upsample import upsample_visibility
 
 LEAST_LENGTH = 1e-6  # of a normal: shorter ones are noise
 
@@ -83,6 +84,7 @@ class AmbientVisibility(nn.Module, abc.ABC):
     radius = Positive()
     contrast = Positive()
     denoise: int = 0  # passes of the edge-aware filter; techniques without noise have none
+    half_resolution: bool = False  # compute every other row and column, upsample
 
     def __init__(
         self, values: Mapping[str, float | None], choices: dict[str, Any], learnable: str | tuple[str, ...]
@@ -163,8 +165,12 @@ class AmbientVisibility(nn.Module, abc.ABC):
             return self.forward(batched, frame=frame, backend=backend).squeeze(0)
         with torch.autocast(device_type=gbuffer.depth.device.type, enabled=False):
             depth, valid, normal = self._prepared(gbuffer)
-            visibility = self._visibility(depth, valid, normal, gbuffer.camera, frame=frame, backend=backend)
-            return self._finished(visibility, depth, valid, normal, gbuffer.camera)
+            if self.half_resolution:
+                visibility = self._upsampled(gbuffer, depth, valid, normal, frame=frame, backend=backend)
+            else:
+                visibility = self._visibility(depth, valid, normal, gbuffer.camera, frame=frame, backend=backend)
+                visibility = self._denoised(visibility, depth, valid, normal, gbuffer.camera)
+            return self._finished(visibility, valid)
 
     @staticmethod
     def _prepared(gbuffer: GBuffer) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -175,12 +181,8 @@ class AmbientVisibility(nn.Module, abc.ABC):
         normal = None if gbuffer.normal is None else _unit(_wide(gbuffer.normal), valid[:, :1])
         return depth, valid, normal
 
-    def _finished(
-        self, visibility: Tensor, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera
-    ) -> Tensor:
-        """(B, 1, H, W): filtered, raised to the contrast, 1 at invalid pixels."""
-        if self.denoise:
-            visibility = self._denoised(visibility, depth, valid, normal, camera)
+    def _finished(self, visibility: Tensor, valid: Tensor) -> Tensor:
+        """(B, 1, H, W): raised to the contrast, 1 at invalid pixels."""
         visibility = contrast_power(visibility, self.contrast.to(visibility.dtype))
         return torch.where(valid[:, :1], visibility[:, None], 1.0)
 
@@ -188,11 +190,23 @@ class AmbientVisibility(nn.Module, abc.ABC):
         self, visibility: Tensor, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera
     ) -> Tensor:
         """`denoise` passes of the edge-aware filter over the visibility (B, H, W)."""
-        points = camera.unproject(depth[:, :1])[:, :, 0]
-        if normal is None:
-            normal = normals_from_points(points, valid[:, 0])
+        if not self.denoise:
+            return visibility
+        points, normal = _surface(depth, valid, normal, camera)
         radius = self.radius.to(depth.dtype).expand(depth.shape[0])
         return denoise_visibility(visibility, points, normal, valid[:, 0], radius, passes=self.denoise)
+
+    def _upsampled(
+        self, gbuffer: GBuffer, depth: Tensor, valid: Tensor, normal: Tensor | None, *, frame: int, backend: str
+    ) -> Tensor:
+        """Visibility of every other row and column, denoised there, carried to the rest along surfaces."""
+        points, full_normal = _surface(depth, valid, normal, gbuffer.camera)
+        few = None if normal is None else normal[..., ::2, ::2]
+        small, camera = (depth[..., ::2, ::2], valid[..., ::2, ::2], few), gbuffer.camera.halved()
+        visibility = self._visibility(*small, camera, frame=frame, backend=backend)
+        visibility = self._denoised(visibility, *small, camera)
+        radius = self.radius.to(depth.dtype).expand(depth.shape[0])
+        return upsample_visibility(visibility, points, full_normal, valid[:, 0], radius)
 
     def extra_repr(self) -> str:
         off = {name: None for name in self.PARAMETERS if getattr(self, name) is None}
@@ -208,6 +222,12 @@ class AmbientVisibility(nn.Module, abc.ABC):
         for name in names:
             checks.check_choice("learnable", name, used)
         return tuple(name for name in used if name in names)
+
+
+def _surface(depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Positions and normals (B, 3, H, W) of the nearest layer."""
+    points = camera.unproject(depth[:, :1])[:, :, 0]
+    return points, normals_from_points(points, valid[:, 0]) if normal is None else normal
 
 
 def _log(value: float) -> float:

@@ -45,6 +45,8 @@ class HBAO(AmbientVisibility):
             None: every tap reads its own pixel.
         offscreen: "open" - what is off the image never occludes; "extend" - the surfaces at the border go on as planes.
         denoise: passes of the edge-aware filter.
+        half_resolution: compute the pixels of even rows and columns only and carry them to the others along surfaces
+            (`ops.upsample`): about a quarter of the time; what is thinner than two pixels may be missed.
         learnable: names of the parameters to register as `nn.Parameter`s, or "all"; the rest are buffers.
     Raises:
         RangeError, ChoiceError.
@@ -68,6 +70,7 @@ class HBAO(AmbientVisibility):
         "max_radius_px",
         "offscreen",
         "denoise",
+        "half_resolution",
     )
 
     falloff = Positive()
@@ -100,8 +103,10 @@ class HBAO(AmbientVisibility):
         max_radius_px: float | None = None,
         offscreen: str = "open",
         denoise: int = 0,
+        half_resolution: bool = False,
         learnable: str | tuple[str, ...] = (),
     ) -> None:
+        checks.check_choice("half_resolution", half_resolution, (False, True))
         checks.check_count("slices", slices, 1)
         checks.check_count("steps", steps, 1)
         checks.check_choice("weighting", weighting, WEIGHTINGS)
@@ -129,6 +134,7 @@ class HBAO(AmbientVisibility):
             "max_radius_px": max_radius_px,
             "offscreen": offscreen,
             "denoise": denoise,
+            "half_resolution": half_resolution,
         }
         super().__init__(values, choices, learnable)
 
@@ -146,9 +152,9 @@ class HBAO(AmbientVisibility):
 
         Args:
             gbuffer, frame: as for `forward`.
-        Returns: (B, 1, H, W) visibility, that of `forward`; and (B, 3, H, W) unit directions in view space, cosine-weighted with
-            weighting "cosine", all alike with "uniform": the normal where nothing is occluded or nothing is open, (0, 0, -1) at
-            invalid pixels. The denoiser and the contrast leave them as they are.
+        Returns: (B, 1, H, W) visibility, that of `forward` at full resolution; and (B, 3, H, W) unit directions in view space,
+            cosine-weighted with weighting "cosine", all alike with "uniform": the normal where nothing is occluded or nothing
+            is open, (0, 0, -1) at invalid pixels. The denoiser and the contrast leave them as they are.
         Gradients: to depth, normal, camera and the module's parameters.
         """
         if gbuffer.depth.ndim == 3:  # inside vmap
@@ -159,7 +165,8 @@ class HBAO(AmbientVisibility):
             depth, valid, normal = self._prepared(gbuffer)
             tensors, options = self._question(depth, valid, normal, gbuffer.camera, frame)
             obscurance, bent = horizon_bent_normal(*tensors, **options)
-            return self._finished(1 - obscurance, depth, valid, normal, gbuffer.camera), bent
+            visibility = self._denoised(1 - obscurance, depth, valid, normal, gbuffer.camera)
+            return self._finished(visibility, valid), bent
 
     def _question(
         self, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera, frame: int

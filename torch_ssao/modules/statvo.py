@@ -35,6 +35,8 @@ class StatVO(AmbientVisibility):
             on real meshes (docs/statvo.md).
         inner_radius: radius of the second window, of the radius, > 0. Its box is as many times smaller in all directions.
         inner_weight: weight of the second window over that of the first, > 0.
+        half_resolution: compute the pixels of even rows and columns only and carry them to the others along surfaces
+            (`ops.upsample`): about a quarter of the time; what is thinner than two pixels may be missed.
         learnable: names of the parameters to register as `nn.Parameter`s, or "all"; the rest are buffers.
     Raises:
         RangeError, ChoiceError.
@@ -49,7 +51,16 @@ class StatVO(AmbientVisibility):
         "inner_radius": ParameterSpec("of the radius", 1 / 32, 1.0, "half-size of the second sample box"),
         "inner_weight": ParameterSpec("1", 1e-2, 1e2, "weight of the second window over that of the first"),
     }
-    CHOICES = ("layers", "layering", "quadrants", "sat_scale", "windows", "gradient", "surrogate_width")
+    CHOICES = (
+        "layers",
+        "layering",
+        "quadrants",
+        "sat_scale",
+        "windows",
+        "gradient",
+        "surrogate_width",
+        "half_resolution",
+    )
 
     radius = Positive()
     height = Positive()
@@ -81,8 +92,10 @@ class StatVO(AmbientVisibility):
         inner_weight: float = 1.0,
         gradient: str = "exact",
         surrogate_width: float = 0.1,
+        half_resolution: bool = False,
         learnable: str | tuple[str, ...] = (),
     ) -> None:
+        checks.check_choice("half_resolution", half_resolution, (False, True))
         check_choices(layers, layering, sat_scale, gradient, surrogate_width)
         checks.check_choice("quadrants", quadrants, (False, True))
         checks.check_choice("windows", windows, (1, 2))
@@ -102,6 +115,7 @@ class StatVO(AmbientVisibility):
             "windows": windows,
             "gradient": gradient,
             "surrogate_width": surrogate_width,
+            "half_resolution": half_resolution,
         }
         super().__init__(values, choices, learnable)
 

@@ -224,7 +224,7 @@ class _March(NamedTuple):
         totals = [None if t is None else torch.zeros_like(t) for t in inputs[:5]]
         to_stored = torch.zeros_like(stored)
         flat = to_stored.view(-1, stored.shape[2] * 4)
-        for rays in self.blocks(inputs):
+        for rays in self.blocks(inputs, derivative=True):
             at = rays[0].images, rays[0].pixels
             for block in rays:
                 piece = _Piece(self, block, inputs, stored)
@@ -254,7 +254,7 @@ class _March(NamedTuple):
             moves[2] = torch.zeros_like(inputs.reach)
         total = torch.zeros_like(inputs.reach)
         moved = _stored(moves[5], inputs.pyramid)  # type: ignore[arg-type]
-        for rays in self.blocks(inputs):
+        for rays in self.blocks(inputs, derivative=True):
             at = rays[0].images, rays[0].pixels
             for block in rays:
                 piece = _Piece(self, block, inputs, stored)
@@ -266,10 +266,11 @@ class _March(NamedTuple):
                 total[at] += by_reach[at] * self.by_reach(rays, inputs, stored)
         return total
 
-    def blocks(self, inputs: _Inputs) -> Iterator[list[_Block]]:
-        """Those of the same pixels together: they differ in their rays."""
+    def blocks(self, inputs: _Inputs, *, derivative: bool = False) -> Iterator[list[_Block]]:
+        """Those of the same pixels together: they differ in their rays. A derivative records them: half as many at once."""
         batch, count = inputs.reach.shape
-        budget = max(1, _TAPS_AT_ONCE.get(inputs.reach.device.type, 2**17) // self.spec.steps)
+        taps = _TAPS_AT_ONCE.get(inputs.reach.device.type, 2**17)
+        budget = max(1, taps // (2 * self.spec.steps if derivative else self.spec.steps))
         pixels = min(count, budget)
         images = min(batch, max(1, budget // count))
         rays = min(len(self.disk), max(1, budget // (pixels * images)))

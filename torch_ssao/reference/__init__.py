@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torch_ssao.reference.image_files import load_image as load_image
 from torch_ssao.reference.raytrace import FALLOFFS as FALLOFFS
 from torch_ssao.reference.raytrace import raytrace as raytrace
 from torch_ssao.reference.storage import Reference as Reference

@@ -17,6 +17,11 @@ COUNTS: dict[str, tuple[str, ...]] = {
 """The counts of each technique that speed and error depend on."""
 SWEEPS: dict[str, tuple[tuple[int, ...], ...]] = {"hbao": ((2, 4), (3, 6)), "ray_march": ((16, 8),)}
 """Counts that are measured where none are given; `LAYERS` for techniques with layers."""
+FINE_SWEEPS: dict[str, tuple[tuple[int, ...], ...]] = {
+    "hbao": ((1, 4), (2, 4), (2, 6), (3, 6), (4, 8)),
+    "ray_march": ((4, 4), (8, 4), (8, 8), (16, 8)),
+}
+"""As `SWEEPS`, where the cheapest that is good enough is looked for: each half again to twice the work of the one before."""
 TITLES = {"statvo": "StatVO", "hbao": "HBAO", "ray_march": "ray march"}
 """Techniques by name in `TECHNIQUES`, for people."""
 MEANINGS = {
@@ -32,6 +37,8 @@ def candidates(
     radius: float,
     layers: Sequence[int] = LAYERS,
     options: Mapping[str, Any] | None = None,
+    *,
+    fine: bool = False,
 ) -> list[Candidate]:
     """Modules with default values but for the radius and the options, one per layer count or pair of counts.
 
@@ -42,6 +49,7 @@ def candidates(
         options: arguments of the techniques by name. An option goes to every technique that has it. Counts (`COUNTS`) are
             one number or several; those of a pair are taken together: slices (3, 4) and steps (4, 8) make 3x4 and 4x8. A
             count whose partner alone is given keeps the technique's default. "layers" goes before the argument layers.
+        fine: whether counts that are not given are those of `FINE_SWEEPS`.
     Returns: (name, label, module) for each, by technique. The label names the technique where it has to.
     Raises: ChoiceError for an unknown technique or an option that no technique has; RangeError for a radius, a count or a
         repetition that cannot be.
@@ -55,7 +63,8 @@ def candidates(
         )
     given = {"layers": tuple(layers), **(options or {})}
     _check_options(names, options or {})
-    return [candidate for name in names for candidate in _of(name, radius, given, alone=len(names) == 1)]
+    sweeps = FINE_SWEEPS if fine else SWEEPS
+    return [candidate for name in names for candidate in _of(name, radius, given, sweeps, alone=len(names) == 1)]
 
 
 def options_of(technique: str) -> tuple[str, ...]:
@@ -64,23 +73,26 @@ def options_of(technique: str) -> tuple[str, ...]:
     return tuple(name for name in (*kind.CHOICES, *kind.PARAMETERS) if name != "radius")
 
 
-def _of(technique: str, radius: float, given: Mapping[str, Any], *, alone: bool) -> list[Candidate]:
+_Sweeps = Mapping[str, tuple[tuple[int, ...], ...]]
+
+
+def _of(technique: str, radius: float, given: Mapping[str, Any], sweeps: _Sweeps, *, alone: bool) -> list[Candidate]:
     kind: Any = TECHNIQUES[technique]
     counts = COUNTS.get(technique, ())
     shared = {name: given[name] for name in options_of(technique) if name in given and name not in counts}
     made = []
-    for numbers in _sweep(technique, given):
+    for numbers in _sweep(technique, given, sweeps):
         module = kind(radius, **shared, **dict(zip(counts, numbers, strict=True)))
         name = "_".join((technique, "x".join(map(str, numbers)))) if numbers else technique
         made.append((name, _label(technique, numbers, alone=alone), module))
     return made
 
 
-def _sweep(technique: str, given: Mapping[str, Any]) -> tuple[tuple[int, ...], ...]:
+def _sweep(technique: str, given: Mapping[str, Any], sweeps: _Sweeps) -> tuple[tuple[int, ...], ...]:
     """The counts of each candidate, in the order of `COUNTS`."""
     names = COUNTS.get(technique, ())
     if not any(name in given for name in names):
-        return SWEEPS.get(technique, ((),))
+        return sweeps.get(technique, ((),))
     kind: Any = TECHNIQUES[technique]
     listed = [_several(given[name] if name in given else getattr(kind(), name)) for name in names]
     longest = max(map(len, listed))

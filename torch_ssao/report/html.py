@@ -1,38 +1,22 @@
-"""One self-contained page: pictures embedded, no script, nothing loaded from elsewhere."""
+"""One self-contained page: pictures, style and script embedded, nothing loaded from elsewhere."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+import hashlib
+from collections.abc import Mapping
 from html import escape
+from importlib import resources
 from typing import TYPE_CHECKING
 
-from torch_ssao.report import tables
+from torch_ssao.report import gallery, tables
 from torch_ssao.report.candidates import MEANINGS
+from torch_ssao.report.markup import picture, plot, table
+from torch_ssao.report.pareto import entries, is_on, pareto_front
 from torch_ssao.report.rows import Row
 
 if TYPE_CHECKING:
     from torch_ssao.report.measure import Measurement
-
-STYLE = """
-:root { color-scheme: light dark; --ink: #1c2024; --soft: #59636e; --line: #d9dee3; --paper: #fff; --shade: #f4f6f8; }
-@media (prefers-color-scheme: dark) {
-  :root { --ink: #e6e9ec; --soft: #9aa4ae; --line: #363c43; --paper: #15181b; --shade: #1e2226; } }
-body { margin: 0 auto; max-width: 70rem; padding: 1.2rem; font: 16px/1.5 system-ui, sans-serif; color: var(--ink);
-  background: var(--paper); }
-h1 { font-size: 1.5rem; margin: .4rem 0; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
-p, li { max-width: 46rem; } .soft, figcaption { color: var(--soft); font-size: .9rem; }
-.warning { border-left: 4px solid #c9821b; padding: .4rem .8rem; background: var(--shade); }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
-th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; } td.text { text-align: left; white-space: normal; }
-tr.best { background: var(--shade); font-weight: 600; }
-figure { margin: 0; } img { width: 100%; height: auto; display: block; background: #fff; }
-.plot { max-width: 46rem; }
-.grid { display: grid; gap: .8rem; grid-template-columns: repeat(auto-fit, minmax(min(15rem, 100%), 1fr)); }
-h3 { font-size: 1rem; margin: 1.2rem 0 .3rem; }
-"""
 
 
 def page(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
@@ -41,35 +25,55 @@ def page(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
     Args:
         measurement: what was measured.
         pictures: PNG files by name, those of `make_report`.
-    Returns: the page; every text in it is escaped, every picture embedded.
+    Returns: the page; every text in it is escaped, every picture embedded once. A content security policy lets a browser run
+        this page's own script and load nothing.
     """
     name = escape(measurement.scene.name)
+    overview = "The reference and of each technique the fitted model of least error on the judged views."
     parts = [
         f"<h1>{name}: speed against error</h1>",
+        _choice(measurement),
         _summary(measurement),
         _warning(measurement),
         "<h2>Error and time</h2>",
-        _plot(pictures, "speed_error.png", "Error against time; bars are quartiles of the time."),
+        plot(pictures, "speed_error.png", "Error against time; bars are quartiles of the time."),
         _scores(measurement),
         _score_notes(measurement),
+        gallery.compare(measurement, pictures, shown_first(measurement).name),
         f"<h2>Pictures, view {measurement.judged_views[0]}</h2>",
-        _picture(
-            pictures,
-            "techniques.png",
-            "The reference and of each technique the fitted model of least error on the judged views.",
-        ),
-        _gallery(measurement, pictures),
+        picture(pictures, "techniques.png", overview),
+        gallery.everything(measurement, pictures),
         "<h2>Fitted values</h2>",
         _values(measurement, pictures),
         "<h2>How this was measured</h2>",
         _conditions(measurement),
     ]
+    style, script = _asset("page.css"), _asset("page.js")
+    policy = f"default-src 'none'; img-src data:; style-src {_digest(style)}; script-src {_digest(script)}"
     head = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{name}: speed against error</title><style>{STYLE}</style></head>\n<body>\n"
+        f"<title>{name}: speed against error</title><style>{style}</style></head>\n<body>\n"
     )
-    return head + "\n".join(part for part in parts if part) + "\n</body></html>\n"
+    return head + "\n".join(part for part in parts if part) + f"\n<script>{script}</script>\n</body></html>\n"
+
+
+def shown_first(measurement: Measurement) -> Row:
+    """The fitted row that was chosen, or else the one of least error."""
+    chosen = measurement.chosen
+    for row in measurement.rows:
+        if chosen is not None and row.is_fitted and row.name == chosen.name:
+            return row
+    return best_row(measurement)
+
+
+def _asset(name: str) -> str:
+    return resources.files("torch_ssao.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _digest(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
 
 
 def best_row(measurement: Measurement) -> Row:
@@ -98,10 +102,20 @@ def _warning(measurement: Measurement) -> str:
     )
 
 
+def _choice(measurement: Measurement) -> str:
+    chosen = measurement.chosen
+    if chosen is None:
+        return ""
+    kind = "choice" if chosen.reached else "warning"
+    notes = "".join(f"<br>{escape(note)}" for note in chosen.notes)
+    title = "Chosen" if chosen.reached else "Not reached; nearest"
+    return f'<p class="{kind}"><strong>{title}: {escape(chosen.label)}</strong>. {escape(chosen.reason)}{notes}</p>'
+
+
 def _scores(measurement: Measurement) -> str:
-    cells = tables.score_cells(measurement)
-    best = measurement.rows.index(best_row(measurement))
-    return _table(tables.COLUMNS, cells, best=best)
+    first = shown_first(measurement)
+    best = [index for index, row in enumerate(measurement.rows) if row is first]
+    return table(tables.columns(measurement), tables.score_cells(measurement), best=best)
 
 
 def _score_notes(measurement: Measurement) -> str:
@@ -124,37 +138,38 @@ def _score_notes(measurement: Measurement) -> str:
         f"RMSE of these two references divided by sqrt(2) is {ceiling.rmse_pair:.4f}, a check of the stated "
         f"{ceiling.rmse:.4f}."
     )
-    return f'<p class="soft">{judged} {timed} {counts} {noise}</p>'
+    return f'<p class="soft">{judged} {timed} {_front(measurement)} {counts} {noise}</p>{_peer_notes(measurement)}'
 
 
-def _gallery(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
-    parts = [f'<div class="grid">{_picture(pictures, "reference.png", "Ray-traced reference")}</div>']
-    for name in dict.fromkeys(row.name for row in measurement.rows):
-        figures = []
-        for row in (row for row in measurement.rows if row.name == name):
-            state = "fitted" if row.is_fitted else "untuned"
-            error = f"{name}_{state}_error.png"
-            figures += [_picture(pictures, f"{name}_{state}.png", state), _picture(pictures, error, f"{state}, error")]
-        label = next(row.label for row in measurement.rows if row.name == name)
-        parts.append(f'<h3>{escape(label)}</h3><div class="grid">{"".join(figures)}</div>')
-    parts.append(
-        '<p class="soft">Grey pictures are visibility in linear 8-bit grey without gamma, 255 = open. Error maps: red '
-        "is too open, blue too dark, grey sees nothing.</p>"
+def _front(measurement: Measurement) -> str:
+    mark, front = tables.ON_FRONT, pareto_front(measurement)
+    peers = [escape(peer.name) for peer in measurement.peers if is_on(front, peer)]
+    theirs = f" Peers on it: {', '.join(peers)}." if peers else ""
+    return (
+        f"{mark}: on the Pareto front: none of these {len(entries(measurement))} is both faster and nearer (a model untuned and "
+        f"fitted does the same work: the better of the two competes).{theirs}"
     )
-    return "\n".join(parts)
+
+
+def _peer_notes(measurement: Measurement) -> str:
+    if not measurement.peers:
+        return ""
+    notes = "".join(f"<li>{escape(peer.name)}: {escape(peer.note)}</li>" for peer in measurement.peers if peer.note)
+    text = "Peers are rows of a file, not measured here: compare their times only where they ran on the same machine."
+    return f'<p class="soft">{text}</p>' + (f'<ul class="soft">{notes}</ul>' if notes else "")
 
 
 def _values(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:
     caption = "Fitted values with standard errors; the dash is the start, hollow is not determined by these views."
-    plot = _plot(pictures, "fitted_values.png", caption)
+    figure = plot(pictures, "fitted_values.png", caption)
     fits = [
-        f"<li>{escape(row.label)}: {row.fit.evaluations} evaluations, {row.fit.steps} steps, {row.fit.seconds:.1f} s: "
+        f"<li>{escape(row.label)}: {row.fit.evaluations} evaluations, {row.fit.seconds:.1f} s: "
         f"{escape(row.fit.message)}</li>"
         for row in measurement.rows
         if row.fit is not None
     ]
-    table = _table(tables.VALUE_COLUMNS, tables.value_cells(measurement), text_columns=(1, 4))
-    return f'{plot}{table}<ul class="soft">{"".join(fits)}</ul>'
+    cells = table(tables.VALUE_COLUMNS, tables.value_cells(measurement), text_columns=(1, 4))
+    return f'{figure}{cells}<ul class="soft">{"".join(fits)}</ul>'
 
 
 def _conditions(measurement: Measurement) -> str:
@@ -175,32 +190,4 @@ def _conditions(measurement: Measurement) -> str:
         if not row.is_fitted:
             choices = row.module.config().items()
             facts[row.label] = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in choices)
-    rows = "".join(
-        f'<tr><td>{escape(key)}</td><td class="text">{escape(str(text))}</td></tr>' for key, text in facts.items()
-    )
-    return f'<div class="scroll"><table>{rows}</table></div>'
-
-
-def _table(
-    head: Sequence[str], rows: Sequence[Sequence[str]], *, best: int | None = None, text_columns: Sequence[int] = ()
-) -> str:
-    lines = []
-    for index, row in enumerate(rows):
-        cells = "".join(
-            f"<td{' class=text' if i in text_columns else ''}>{escape(cell)}</td>" for i, cell in enumerate(row)
-        )
-        lines.append(f"<tr{' class=best' if index == best else ''}>{cells}</tr>")
-    top = "".join(f"<th>{escape(title)}</th>" for title in head)
-    return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
-
-
-def _plot(pictures: Mapping[str, bytes], name: str, caption: str) -> str:
-    return f'<div class="plot">{_picture(pictures, name, caption)}</div>' if name in pictures else ""
-
-
-def _picture(pictures: Mapping[str, bytes], name: str, caption: str) -> str:
-    if name not in pictures:
-        return ""
-    data = base64.b64encode(pictures[name]).decode("ascii")
-    text = escape(caption, quote=True)
-    return f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
+    return table((), [(key, str(text)) for key, text in facts.items()], text_columns=(1,))

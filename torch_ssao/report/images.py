@@ -66,6 +66,10 @@ def write(path: Path, content: bytes) -> None:
     try:
         partial.write_bytes(content)
         os.replace(partial, path)
+    except OSError as error:
+        if error.filename is None:  # a disk that fills up while a file is written
+            error.filename = str(path)
+        raise
     finally:
         partial.unlink(missing_ok=True)
 

@@ -33,6 +33,9 @@ def make_report(
     max_evaluations: int | None = None,
     repeats: int = REPEATS,
     seed: int = 0,
+    target_rmse: float | None = None,
+    budget_ms: float | None = None,
+    peers: str | Path | None = None,
     progress: bool | None = None,
 ) -> Measurement:
     """Measure techniques on a scene and write the report.
@@ -40,9 +43,9 @@ def make_report(
     Args: those of `measure`.
     Returns: the `Measurement`; `files` names what was written to `out`: what `measure` writes, and report.html
         (self-contained), speed_error.png, fitted_values.png, and for the first judged view reference.png and, for every
-        model, <name>_untuned.png, <name>_fitted.png, <name>_untuned_error.png, <name>_fitted_error.png. Grey pictures
-        are visibility in linear 8-bit grey, 255 = open. Of several techniques, techniques.png shows the best of each
-        beside the reference.
+        model, <name>_untuned.png, <name>_fitted.png, <name>_untuned_error.png, <name>_fitted_error.png; chosen_<view>.png is
+        what the module in chosen.json gives for each judged view. Grey pictures are visibility in linear 8-bit grey, 255 =
+        open. Of several techniques, techniques.png shows the best of each beside the reference.
     Raises: as `measure`, and MissingExtraError without the extra `report`, before any work.
     Cost: as `measure`, and about 0.3 s a picture.
     """
@@ -63,12 +66,16 @@ def make_report(
         max_evaluations=max_evaluations,
         repeats=repeats,
         seed=seed,
+        target_rmse=target_rmse,
+        budget_ms=budget_ms,
+        peers=peers,
         progress=progress,
     )
     pictures = draw(measurement)
+    page = html.page(measurement, pictures)
+    pictures |= draw_chosen(measurement)
     for name, content in pictures.items():
         images.write(measurement.out / name, content)
-    page = html.page(measurement, pictures)
     images.write(measurement.out / "report.html", page.encode())
     return write_json(measurement, *pictures, "report.html")
 
@@ -89,3 +96,14 @@ def draw(measurement: Measurement) -> dict[str, bytes]:
         pictures[f"{name}.png"] = images.grey_png(prediction)
         pictures[f"{name}_error.png"] = images.error_png(prediction, target, valid)
     return pictures
+
+
+def draw_chosen(measurement: Measurement) -> dict[str, bytes]:
+    """The chosen module's visibility of every judged view as PNG files by name; not on the page, where it is shown already."""
+    chosen = measurement.chosen
+    rows = [row for row in measurement.rows if row.is_fitted and chosen is not None and row.name == chosen.name]
+    return {
+        f"chosen_{view}.png": images.grey_png(predict(row.module, measurement.gbuffer[index])[0])
+        for row in rows
+        for index, view in enumerate(measurement.judged_views)
+    }

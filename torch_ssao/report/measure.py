@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -13,17 +12,23 @@ from typing import TYPE_CHECKING, Any, final
 from torch_ssao import checks, serialize
 from torch_ssao.gbuffer import GBuffer
 from torch_ssao.modules import AmbientVisibility
+from torch_ssao.report import images, spreadsheet
 from torch_ssao.report import rows as row_tools
 from torch_ssao.report.candidates import LAYERS, candidates
+from torch_ssao.report.choosing import Chosen, Fitted, Wish, fit_and_choose
 from torch_ssao.report.environment import environment, require
-from torch_ssao.report.rows import FitSummary, Row, Score
+from torch_ssao.report.pareto import is_on, pareto_front
+from torch_ssao.report.peers import Peer, load_peers
+from torch_ssao.report.rows import Row, Score
 from torch_ssao.report.truth import CEILING_SEED_STEP, Ceiling, TraceSettings, Truth, noise_ceiling, trace_views
 
 if TYPE_CHECKING:
     from torch_ssao.scenes import Scene
 
 FORMAT = "torch_ssao.report"
-VERSION = 1
+VERSION = 2
+FITS = "fits"
+"""Folder of the fitted modules that the next run reads back, inside that of the results."""
 SMALLEST = 11
 """Pixels: the window of SSIM."""
 
@@ -53,6 +58,8 @@ class Measurement:
         gbuffer, truth: of the judged views.
         environment: see `environment.environment`.
         files: everything written so far, relative to `out`.
+        peers: results of other implementations, from a file.
+        chosen: the choice among the fitted modules.
     """
 
     scene: Scene
@@ -67,6 +74,8 @@ class Measurement:
     truth: Truth
     environment: dict[str, Any]
     files: tuple[str, ...]
+    peers: tuple[Peer, ...] = ()
+    chosen: Chosen | None = None
 
     @property
     def techniques(self) -> tuple[str, ...]:
@@ -86,6 +95,7 @@ class Measurement:
 
     def as_dict(self) -> dict[str, Any]:
         """The measurement as plain values, as in report.json."""
+        front = pareto_front(self)
         scene = {"name": self.scene.name, "faces": len(self.scene.faces), "fingerprint": self.scene.fingerprint}
         return row_tools.plain(
             {
@@ -97,7 +107,9 @@ class Measurement:
                 "judged_views": self.judged_views,
                 "judged_on_training_views": self.judged_on_training_views,
                 "techniques": self.techniques,
-                "rows": [row.as_dict() for row in self.rows],
+                "chosen": None if self.chosen is None else asdict(self.chosen),
+                "rows": [row.as_dict() | {"pareto": is_on(front, row)} for row in self.rows],
+                "peers": [peer.as_dict() | {"pareto": is_on(front, peer)} for peer in self.peers],
                 "constant": asdict(self.constant),
                 "ceiling": asdict(self.ceiling),
                 "environment": self.environment,
@@ -123,14 +135,18 @@ def measure(
     max_evaluations: int | None = None,
     repeats: int = row_tools.REPEATS,
     seed: int = 0,
+    target_rmse: float | None = None,
+    budget_ms: float | None = None,
+    peers: str | Path | None = None,
     progress: bool | None = None,
 ) -> Measurement:
     """Measure techniques on a scene, untuned and fitted, against ray-traced references.
 
     Args:
         scene: from `scenes.builtin` or `scenes.load`.
-        out: folder, made where it is missing. Written: a reference per view (read back by the next run), each fitted
-            module as JSON as soon as it is fitted, report.json.
+        out: folder, made where it is missing. Written: a reference per view and, in `fits`, each fitted module as soon as it
+            is done (both read back by the next run, which goes on from there), then all fitted modules as JSON, the chosen one as
+            chosen.json too, report.csv and report.json.
         views: the views to judge on; None for all of the scene. Those used for fitting are left out, unless none
             remains: then the fitted views are judged and marked as training views everywhere.
         height, width: image size in pixels, at least 11 (the window of SSIM).
@@ -144,6 +160,9 @@ def measure(
         max_evaluations: budget of each fit; None for that of `fitting.fit`.
         repeats: timed forward passes per module, at least 5.
         seed: of the reference's sampling pattern.
+        target_rmse, budget_ms: what the chosen module has to reach, error on the judged views and milliseconds a view; see
+            `fitting.select`, also for what is chosen without. With either, counts that are left out are swept more finely.
+        peers: JSON file with results of other implementations on this scene and size; see `peers.load_peers`.
         progress: bars and notes on stderr; None shows them on a terminal only.
     Returns: a `Measurement`; its errors are of the judged views first and of the fitted views second.
     Raises: RangeError, ChoiceError, SceneError for arguments that cannot be; MissingExtraError without the extras
@@ -153,26 +172,40 @@ def measure(
     require("measure", "scenes", "trimesh", "embreex")  # before any work: without the extras nothing should be traced
     require("measure", "fitting", "optimistix")
     settings = TraceSettings(height, width, scene.radius if radius is None else radius, samples, seed)
-    modules = candidates(technique, settings.radius, layers, options)
+    fine = target_rmse is not None or budget_ms is not None
+    modules = candidates(technique, settings.radius, layers, options, fine=fine)
     fit_on, judged = _split_views(scene, views, fit_views)
-    _check_arguments(settings, repeats)
+    wish = Wish(target_rmse, budget_ms)
+    _check_arguments(settings, repeats, wish)
+    others = () if peers is None else load_peers(peers, scene=scene.name, height=height, width=width)
     _check_fits([module for *_, module in modules], parameters, max_evaluations)
     folder = checks.check_output_folder("out", out)
-    return _run(_Plan(scene, folder, settings, modules, fit_on, judged, parameters, max_evaluations, repeats, progress))
+    checks.check_output_folder("out", folder / FITS)
+    return _run(
+        _Plan(
+            scene,
+            folder,
+            settings,
+            modules,
+            fit_on,
+            judged,
+            parameters,
+            max_evaluations,
+            repeats,
+            progress,
+            wish,
+            others,
+        )
+    )
 
 
 def write_json(measurement: Measurement, *more_files: str) -> Measurement:
     """Write report.json in one step; return the measurement with it and `more_files` among its files."""
     files = dict.fromkeys([*measurement.files, *more_files, "report.json"])
     measurement = replace(measurement, files=tuple(files))
-    path = measurement.out / "report.json"
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_text(json.dumps(measurement.as_dict(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(partial, path)
+    text = json.dumps(measurement.as_dict(), indent=2, allow_nan=False) + "\n"
+    images.write(measurement.out / "report.json", text.encode())
     return measurement
-
-
-_Fit = tuple[str, str, AmbientVisibility, FitSummary | None]
 
 
 @final
@@ -190,6 +223,8 @@ class _Plan:
     max_evaluations: int | None
     repeats: int
     progress: bool | None
+    wish: Wish
+    peers: tuple[Peer, ...]
 
     def note(self, text: str) -> None:
         """One line on stderr, where progress is shown."""
@@ -211,9 +246,7 @@ class _Data:
 
 def _run(plan: _Plan) -> Measurement:
     data = _trace_all(plan)
-    fits, files = _fit_all(plan, data)
-    plan.note("timing")
-    measured = _judge(fits, data, plan.repeats)
+    fits, chosen = _fit_all(plan, data)
     mean = row_tools.best_constant(data.truth[data.training])
     judged_on = (data.validation, data.training)
     constant = Constant(mean, *(row_tools.score_constant(mean, data.truth[rows]) for rows in judged_on))
@@ -223,15 +256,18 @@ def _run(plan: _Plan) -> Measurement:
         settings=plan.settings,
         fit_views=tuple(plan.fit_on),
         judged_views=tuple(plan.judged),
-        rows=measured,
+        rows=_judge(plan, fits, data),
         constant=constant,
         ceiling=data.ceiling,
         gbuffer=data.gbuffer[data.validation],
         truth=data.truth[data.validation],
         environment=environment(data.gbuffer.depth.device),
-        files=files,
+        files=tuple(f"{name}.json" for name in (*fits, "chosen")),
+        peers=plan.peers,
+        chosen=chosen,
     )
-    return write_json(measurement)
+    images.write(plan.folder / "report.csv", spreadsheet.csv_text(measurement).encode())
+    return write_json(measurement, "report.csv")
 
 
 def _trace_all(plan: _Plan) -> _Data:
@@ -253,33 +289,40 @@ def _trace_all(plan: _Plan) -> _Data:
     return _Data(gbuffer, truth, training, validation, noise_ceiling(truth[validation], second))
 
 
-def _fit_all(plan: _Plan, data: _Data) -> tuple[list[_Fit], tuple[str, ...]]:
-    """All modules untuned, then fitted; each fitted one is saved at once."""
-    from torch_ssao import fitting
+def _fit_all(plan: _Plan, data: _Data) -> tuple[dict[str, Fitted], Chosen]:
+    """All modules fitted, timed and saved, and the choice among them."""
+    modules = {name: module for name, _, module in plan.modules}
+    options: dict[str, Any] = {"parameters": plan.parameters, "progress": plan.progress}
+    if plan.max_evaluations is not None:
+        options["fit_options"] = {"max_evaluations": plan.max_evaluations}
+    plan.note(f"fitting and timing {', '.join(modules)}")
+    fits, chosen = fit_and_choose(
+        modules,
+        data.gbuffer,
+        data.truth,
+        data.training,
+        data.validation,
+        plan.wish,
+        folder=plan.folder / FITS,
+        repeats=plan.repeats,
+        options=options,
+    )
+    for name, fitted in fits.items():
+        serialize.save(fitted.module, plan.folder / f"{name}.json")
+    serialize.save(fits[chosen.name].module, plan.folder / "chosen.json")
+    return fits, chosen
 
-    gbuffer, truth = data.gbuffer[data.training], data.truth[data.training]
-    fitted: list[_Fit] = []
-    for name, label, module in plan.modules:
-        plan.note(f"fitting {label}")
-        result = fitting.fit(
-            module,
-            gbuffer,
-            truth,
-            parameters=_fitted_names(module, plan.parameters),
-            valid=truth.valid,
-            max_evaluations=plan.max_evaluations,
-            progress=plan.progress,
-        )
-        serialize.save(result.module, plan.folder / f"{name}.json")
-        fitted.append((name, label, result.module, _summarise(result)))
-    untuned: list[_Fit] = [(*entry, None) for entry in plan.modules]
-    return untuned + fitted, tuple(f"{name}.json" for name, *_ in fitted)
 
-
-def _judge(fits: list[_Fit], data: _Data, repeats: int) -> tuple[Row, ...]:
-    timings = row_tools.time_forward([fit[2] for fit in fits], data.gbuffer[data.validation[0]], repeats=repeats)
+def _judge(plan: _Plan, fits: Mapping[str, Fitted], data: _Data) -> tuple[Row, ...]:
+    """Rows of the untuned modules, then of the fitted ones."""
+    untuned, tuned = [], []
+    for name, label, _ in plan.modules:
+        if name in fits:
+            fit = fits[name]
+            untuned.append((name, label, fit.untuned, fit.untuned_timing, None))
+            tuned.append((name, label, fit.module, fit.timing, fit.summary))
     measured = []
-    for (name, label, module, summary), timing in zip(fits, timings, strict=True):
+    for name, label, module, timing, summary in [*untuned, *tuned]:
         prediction = row_tools.predict(module, data.gbuffer)
         validation, training = (
             row_tools.score(prediction[rows], data.truth[rows]) for rows in (data.validation, data.training)
@@ -295,11 +338,14 @@ def _split_views(scene: Scene, views: Iterable[int] | None, fit_views: Iterable[
     return fit_on, judged or fit_on
 
 
-def _check_arguments(settings: TraceSettings, repeats: int) -> None:
+def _check_arguments(settings: TraceSettings, repeats: int, wish: Wish) -> None:
     checks.check_count("height", settings.height, SMALLEST)
     checks.check_count("width", settings.width, SMALLEST)
     checks.check_count("samples", settings.samples, 2)
     checks.check_count("repeats", repeats, 5)
+    for name, value in asdict(wish).items():
+        if value is not None:
+            checks.check_positive(name, value)
 
 
 def _check_fits(
@@ -327,8 +373,3 @@ def _check_fits(
 def _fitted_names(module: AmbientVisibility, parameters: tuple[str, ...] | None) -> tuple[str, ...]:
     used = module.used_parameters()
     return used if parameters is None else tuple(name for name in used if name in parameters)
-
-
-def _summarise(result: Any) -> FitSummary:
-    errors, undetermined = dict(result.standard_errors), tuple(result.undetermined)
-    return FitSummary(errors, undetermined, result.steps, result.evaluations, result.seconds, result.message)

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 from torch_ssao.report.candidates import TITLES
 from torch_ssao.report.images import figure_png
+from torch_ssao.report.pareto import entries, pareto_front
 from torch_ssao.report.rows import Row
 
 if TYPE_CHECKING:
     from torch_ssao.report.measure import Measurement
 
 UNTUNED, FITTED = "#b4552d", "#1f6f8b"
+PEER, FRONT = "0.25", "#e0a83c"
 COLOURS, MARKERS = ("#1f6f8b", "#b4552d", "#6b7f1f", "#7b4b94"), ("o", "s", "^", "D")
 """Of techniques in the order of the report."""
 
@@ -41,6 +43,8 @@ def speed_error_png(measurement: Measurement) -> bytes:
             _draw_rows(axes, rows, style)
             for row in rows:
                 _annotate(axes, row, measurement, colour)
+    _draw_peers(axes, measurement)
+    _draw_front(axes, measurement)
     constant, ceiling = measurement.constant.validation.rmse, measurement.ceiling.rmse
     axes.axhline(constant, color="0.35", linestyle="--", linewidth=1.1, label=f"constant image, {constant:.3f}")
     axes.axhline(ceiling, color="0.35", linestyle=":", linewidth=1.3, label=f"noise of the reference, {ceiling:.4f}")
@@ -64,6 +68,32 @@ def _draw_rows(axes: Any, rows: list[Row], style: dict[str, Any]) -> None:
     )
 
 
+def _draw_peers(axes: Any, measurement: Measurement) -> None:
+    """Crosses with names; those without a time are in the table only."""
+    shown = [(peer.name, peer.timing, peer.validation.rmse) for peer in measurement.peers if peer.timing is not None]
+    for index, (name, timing, error) in enumerate(shown):
+        bars = [[timing.median_ms - timing.low_ms], [timing.high_ms - timing.median_ms]]
+        style: dict[str, Any] = {"linestyle": "none", "marker": "X", "markersize": 8, "capsize": 2, "elinewidth": 1.0}
+        style |= {"color": PEER, "label": "peer" if index == 0 else None, "zorder": 3}
+        axes.errorbar(timing.median_ms, error, xerr=bars, **style)
+        label: dict[str, Any] = {
+            "ha": "center",
+            "fontsize": 8,
+            "color": PEER,
+            "textcoords": "offset points",
+            "zorder": 4,
+        }
+        axes.annotate(name, (timing.median_ms, error), xytext=(8, 0), **label)
+
+
+def _draw_front(axes: Any, measurement: Measurement) -> None:
+    """A staircase: what is above and right of it is beaten in both error and time."""
+    front = [(entry.timing.median_ms, entry.validation.rmse) for entry in pareto_front(measurement) if entry.timing]
+    times, errors = zip(*front, strict=True)
+    style: dict[str, Any] = {"color": FRONT, "linewidth": 5.0, "alpha": 0.35, "zorder": 2, "label": "Pareto front"}
+    axes.step(times, errors, where="post", marker="o", markersize=15, markeredgewidth=0, **style)
+
+
 def _annotate(axes: Any, row: Row, measurement: Measurement, colour: str) -> None:
     """The model's label; of an untuned and fitted pair the worse is labelled above and the better below."""
     error = row.validation.rmse
@@ -79,7 +109,7 @@ def _finish(axes: Any, measurement: Measurement) -> None:
     axes.set_xscale("log")
     _readable_ticks(axes.xaxis)
     axes.margins(x=0.12)
-    worst = max(row.validation.rmse for row in measurement.rows)
+    worst = max(entry.validation.rmse for entry in entries(measurement))
     axes.set_ylim(0, 1.15 * max(worst, measurement.constant.validation.rmse))  # room for the label of the worst
     threads_text = f"{threads} thread{'s' if threads != 1 else ''}"
     axes.set_xlabel(f"milliseconds a view, forward, {settings.width}x{settings.height}, {threads_text}")

@@ -35,7 +35,6 @@ class FitSummary:
 
     standard_errors: dict[str, float]
     undetermined: tuple[str, ...]
-    steps: int
     evaluations: int
     seconds: float
     message: str

@@ -6,24 +6,36 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from torch_ssao.report.rows import Row, Score
+from torch_ssao.report.pareto import Entry, entries, is_on, pareto_front
+from torch_ssao.report.peers import Peer
+from torch_ssao.report.rows import Row, Score, Timing
 from torch_ssao.report.truth import Ceiling
 
 if TYPE_CHECKING:
     from torch_ssao.report.measure import Measurement
 
-COLUMNS = ("model", "RMSE", "PSNR", "SSIM", "training RMSE", "PSNR", "SSIM", "ms a view (quartiles)")
+ON_FRONT = "*"
 VALUE_COLUMNS = ("model", "parameter", "value", "standard error", "meaning")
 
 UNDETERMINED = "not determined by these views"
 
 
+def columns(measurement: Measurement) -> tuple[str, ...]:
+    """The head of the table of errors: those on the judged views first, those on the fitted views second."""
+    judged = "training-view RMSE" if measurement.judged_on_training_views else "validation RMSE"
+    return ("model", judged, "PSNR", "SSIM", "training RMSE", "PSNR", "SSIM", "ms a view (quartiles)", "front")
+
+
 def score_cells(measurement: Measurement) -> list[list[str]]:
-    """Rows of the table of errors under `COLUMNS`: untuned, then fitted modules, constant image, noise ceiling."""
-    cells = [[_title(row), *_score(row.validation), *_score(row.training), _timing(row)] for row in measurement.rows]
+    """Rows of the table of errors under `columns`: untuned, then fitted modules, peers, constant image, noise ceiling."""
+    front = pareto_front(measurement)
+    cells = []
+    for entry in entries(measurement):
+        mark = ON_FRONT if is_on(front, entry) else ""
+        cells.append([_title(entry), *_score(entry.validation), *_score(entry.training), _timing(entry.timing), mark])
     constant = f"constant {measurement.constant.value:.3f}"
-    cells.append([constant, *_score(measurement.constant.validation), *_score(measurement.constant.training), ""])
-    return [*cells, ["noise ceiling", *_ceiling(measurement.ceiling), "", "", "", ""]]
+    cells.append([constant, *_score(measurement.constant.validation), *_score(measurement.constant.training), "", ""])
+    return [*cells, ["noise ceiling", *_ceiling(measurement.ceiling), "", "", "", "", ""]]
 
 
 def value_cells(measurement: Measurement) -> list[list[str]]:
@@ -73,11 +85,15 @@ def number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}"
 
 
-def _title(row: Row) -> str:
-    return f"{row.label}, {'fitted' if row.is_fitted else 'untuned'}"
+def _title(entry: Entry) -> str:
+    if isinstance(entry, Peer):
+        return f"{entry.name}, peer"
+    return f"{entry.label}, {'fitted' if entry.is_fitted else 'untuned'}"
 
 
-def _score(score: Score) -> list[str]:
+def _score(score: Score | None) -> list[str]:
+    if score is None:
+        return ["-", "-", "-"]
     return [number(score.rmse, 4), number(score.psnr, 2), number(score.ssim, 4)]
 
 
@@ -85,9 +101,18 @@ def _ceiling(ceiling: Ceiling) -> list[str]:
     return [number(ceiling.rmse, 4), number(ceiling.psnr, 2), number(ceiling.ssim, 4)]
 
 
-def _timing(row: Row) -> str:
-    timing = row.timing
-    return f"{timing.median_ms:.1f} ({timing.low_ms:.1f}-{timing.high_ms:.1f})"
+def _timing(timing: Timing | None) -> str:
+    if timing is None:
+        return "-"
+    low, median, high = map(milliseconds, (timing.low_ms, timing.median_ms, timing.high_ms))
+    return (
+        median if timing.low_ms == timing.high_ms else f"{median} ({low}-{high})"
+    )  # a peer may come without quartiles
+
+
+def milliseconds(value: float) -> str:
+    """Three digits where there are that many before the point or after it: 0.0213, 8.92, 72.5, 1234.5."""
+    return f"{value:.1f}" if value >= 10 else f"{value:.3g}"
 
 
 def _uncertainty(row: Row, name: str) -> str:

@@ -1,0 +1,1 @@
+"""The tables of the two papers, on scenes at hand, against ray-traced references: `python -m benchmarks.paper_tables`."""
