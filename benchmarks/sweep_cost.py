@@ -1,7 +1,7 @@
 """What choosing a model for a scene costs, and what warm starts save and lose: `python -m benchmarks.sweep_cost`.
 
-For each built-in scene: seconds of rendering, tracing, all fits and all timings of one `select`, with warm starts and, with
-`--cold`, with a scan for every candidate. An interrupted run goes on where it stopped.
+For each built-in scene: seconds of rendering, tracing, all fits and all timings of one `select`, with warm starts and, for
+those of `--cold`, with a scan for every candidate. An interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
 
     row: dict[str, Any] = {"scene": name, "views": len(gbuffer), "rendering_s": rendering, "tracing_s": tracing}
     for label, warm in (("warm", True), ("cold", False)):
-        if warm or options.cold:
+        if warm or name in options.cold:
             folder = options.work / f"{name}_{options.height}_{label}"
             choice = select(grid(scene.radius), gbuffer, truth, warm_start=warm, folder=folder, timer=timer)
             row[label] = summary(choice) | {"timing_s": timing}
@@ -87,17 +87,25 @@ def tables(rows: list[dict[str, Any]]) -> list[str]:
         lines.append(
             f"{SCENES} scenes on {workers} cores: {hours:.2f} h, of which {SCENES * serial / 3600:.2f} h timing."
         )
-    both = [row for row in rows if "cold" in row]
-    if both:
-        lines += ["", "| scene | warm | cold | validation RMSE, warm / cold - 1, by candidate | chosen warm, cold |"]
-        lines.append("|---|---|---|---|---|")
-    for row in both:
-        warm, cold = row["warm"], row["cold"]
-        change = [warm["validation"][name] / cold["validation"][name] - 1 for name in sorted(cold["validation"])]
-        lines.append(
-            f"| {row['scene']} | {warm['fitting_s']:.0f} s, {warm['evaluations']} | {cold['fitting_s']:.0f} s, "
-            f"{cold['evaluations']} | {', '.join(f'{100 * c:+.1f} %' for c in change)} | {warm['chosen']}, {cold['chosen']} |"
-        )
+    for row in rows:
+        if "cold" in row:
+            lines += ["", *comparison(row)]
+    return lines
+
+
+def comparison(row: dict[str, Any]) -> list[str]:
+    """What warm starts save and lose on one scene, candidate by candidate."""
+    warm, cold = row["warm"], row["cold"]
+    lines = [
+        f"{row['scene']}: warm {warm['evaluations']} evaluations, {warm['fitting_s']:.0f} s, {warm['chosen']}; "
+        f"cold {cold['evaluations']}, {cold['fitting_s']:.0f} s, {cold['chosen']}.",
+        "",
+        "| candidate | validation RMSE, warm | cold | training RMSE, warm | cold |",
+        "|---|---|---|---|---|",
+    ]
+    for name in warm["validation"]:
+        figures = [side[kind][name] for kind in ("validation", "training") for side in (warm, cold)]
+        lines.append(f"| {name} | {' | '.join(f'{value:.4f}' for value in figures)} |")
     return lines
 
 
@@ -106,7 +114,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=["temple", "street"], choices=ts.scenes.names())
     parser.add_argument("--height", type=int, default=60)
     parser.add_argument("--samples", type=int, default=64)
-    parser.add_argument("--cold", action="store_true", help="also fit every candidate with a scan")
+    parser.add_argument("--cold", nargs="*", default=[], choices=ts.scenes.names(), help="scenes to fit with scans too")
     parser.add_argument("--work", type=Path, default=Path("out/bench/sweep_cost"))
     parser.add_argument("--out", type=Path, default=Path("out/bench/sweep_cost.json"))
     options = parser.parse_args()

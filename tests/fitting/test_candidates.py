@@ -34,6 +34,7 @@ def test_statvo_is_the_product_in_order_of_cost() -> None:
     [
         (candidates.statvo(layers=[1, 2], sat_scale=2), ["statvo_layers1_sat2", "statvo_layers2_sat2"]),
         (candidates.statvo(layers=4, sat_scale=1), ["statvo_layers4"]),
+        (candidates.statvo(layers=8, half_resolution=[False, True]), ["statvo_layers8_half", "statvo_layers8_nohalf"]),
         (candidates.hbao(slices=2, steps=range(3, 5)), ["hbao_slices2_steps3", "hbao_slices2_steps4"]),
         (
             candidates.hbao(slices=1, steps=4, weighting=["cosine", "uniform"], estimator="increments"),
@@ -66,7 +67,7 @@ def test_options_reach_the_modules() -> None:
 
 def test_all_techniques_holds_each_from_its_smallest_form_up() -> None:
     made = candidates.all_techniques(0.25)
-    assert len(set(names(made))) == len(made) == 40
+    assert len(set(names(made))) == len(made) == 44
     assert {candidate.technique for candidate in made} == set(TECHNIQUES)
     assert {float(candidate.module.radius) for candidate in made} == {0.25}
     assert [candidate.cost for candidate in made] == sorted(candidate.cost for candidate in made)
@@ -82,6 +83,7 @@ def test_more_work_never_costs_less() -> None:
         (ts.HBAO(denoise=0), ts.HBAO(denoise=1)),
         (ts.RayMarchedSSAO(steps=4), ts.RayMarchedSSAO(steps=8)),
         (ts.RayMarchedSSAO(denoise=0), ts.RayMarchedSSAO(denoise=1)),
+        (ts.HBAO(half_resolution=True), ts.HBAO(half_resolution=False)),
     ):
         assert candidates.estimated_cost(less) < candidates.estimated_cost(more)
 

@@ -6,6 +6,7 @@ import json
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,7 +16,7 @@ from torch_ssao import checks, metrics
 from torch_ssao.fitting import candidates, chain, pareto, select
 from torch_ssao.fitting.problem import Problem, ViewError, rmse
 from torch_ssao.fitting.table import Row
-from torch_ssao.fitting.timing import Timing
+from torch_ssao.fitting.timing import Timing, time_forward
 
 
 @pytest.fixture
@@ -130,6 +131,8 @@ def test_the_last_half_is_held_out(smooth: Any) -> None:
         problem = Problem.of(gbuffer[:count], truth[:count])
         assert [sight.number for sight in problem.training] == training
         assert [sight.number for sight in problem.validation] == list(range(len(training), count))
+    for held in ([1], (1,), 1, range(1, 2), torch.tensor([1]), np.array([1])):
+        assert [sight.number for sight in Problem.of(gbuffer, truth, validation=held).validation] == [1]
 
 
 def test_one_view_is_judged_on_itself_and_all_output_says_so(smooth: Any, quick: None) -> None:
@@ -271,7 +274,7 @@ def test_a_candidate_that_crashes_is_a_row_and_the_rest_go_on(smooth: Any, quick
     late = Broken(0.5, layers=2)
     late.calls_left = 4 + 4  # the quick fit and the errors of four views
     grid = {"good": ts.StatVO(0.5), "broken": Broken(0.5), "late": late}
-    choice = select(grid, *smooth, timer=ts.fitting.timing.time_forward)
+    choice = select(grid, *smooth, timer=time_forward)
     assert choice.best.name == "good"
     errors = {item.name: item.error for item in choice.table}
     assert errors["broken"] == "RuntimeError: planted failure"
@@ -323,6 +326,20 @@ def test_views_without_valid_pixels_are_left_out_with_a_note(smooth: Any, quick:
     assert [view.view for view in choice.best.views] == ["view 3"]
     assert choice.notes == ("view 2 has no valid pixel and was left out.",)
     assert choice.notes[0] in str(choice)
+
+
+def test_timed_modules_take_turns() -> None:
+    order: list[int] = []
+
+    class Watched(ts.StatVO):
+        def forward(self, *arguments: Any, **options: Any) -> torch.Tensor:
+            order.append(self.layers)
+            assert not torch.is_grad_enabled()
+            return super().forward(*arguments, **options)
+
+    found = time_forward([Watched(0.5, layers=1), Watched(0.5, layers=2, learnable="all")], bumps(12, 16, views=1))
+    assert order == [1, 2] * 8
+    assert [timing.repeats for timing in found] == [7, 7]
 
 
 def test_no_bar_without_a_terminal(smooth: Any, quick: None, capsys: pytest.CaptureFixture[str]) -> None:

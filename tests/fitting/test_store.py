@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import functools
 import json
 import math
+import os
+import signal
+import time
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +94,27 @@ def test_interrupted_runs_keep_what_is_done_and_go_on(tmp_path: Path, counter: C
     assert counter.calls == 1
     assert facts(resumed) == facts(run(None))
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.parametrize("disguise", [False, True])
+def test_an_interrupt_that_a_library_swallows_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disguise: bool
+) -> None:
+    @functools.wraps(quick_fit)
+    def swallowing(*arguments: Any, **options: Any) -> Any:
+        with contextlib.suppress(KeyboardInterrupt):  # as the garbage collector does with those in its callbacks
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(5)
+        if disguise:
+            raise RuntimeError("the solver was interrupted")
+        return quick_fit(*arguments, **options)
+
+    monkeypatch.setattr(chain, "fit", swallowing)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt, match=f"after {0 if disguise else 1} of 3 candidates"):
+        run(tmp_path)
+    assert len(list(tmp_path.iterdir())) == (0 if disguise else 1)
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_an_interruption_without_a_folder_says_that_nothing_is_kept(counter: Counter) -> None:

@@ -18,9 +18,11 @@ COUNTS: dict[str, tuple[str, ...]] = {
     "ray_march": ("rays", "steps"),
 }
 """The counts of each technique that are always part of a name."""
-SHORT = {"sat_scale": "sat"}
+SHORT = {"sat_scale": "sat", "half_resolution": "half"}
 DENOISE_TAPS = 24
 """Neighbours that a pass of `ops.denoise.denoise_visibility` reads."""
+UPSAMPLE_TAPS = 8
+"""Reads of `ops.upsample.upsample_visibility`."""
 
 
 @final
@@ -74,16 +76,18 @@ def ray_march(radius: Any = 0.5, *, rays: Any = (4, 8, 16), steps: Any = (4, 8),
 
 
 def all_techniques(radius: float) -> list[Candidate]:
-    """Every technique from its smallest form up, 40 candidates: when nothing is known of a scene.
+    """Every technique from its smallest form up, 44 candidates: when nothing is known of a scene.
 
     Args:
         radius: scene units, > 0.
     Returns: StatVO of 1 to 8 layers with and without quadrants, at full and half SAT resolution; HBAO of 1 to 3 slices with 3
-        to 12 steps a side and ray marches of 4 to 16 rays with 4 or 8 steps, plain, and all but the largest denoised.
+        to 12 steps a side and ray marches of 4 to 16 rays with 4 or 8 steps, plain, and all but the largest denoised; the larger
+        HBAOs at half resolution.
     """
     made = statvo(radius, sat_scale=[1, 2], quadrants=[False, True])
     made += hbao(radius) + hbao(radius, slices=[1, 2], steps=[3, 6], denoise=1)
     made += ray_march(radius) + ray_march(radius, rays=[4, 8], steps=[4, 8], denoise=1)
+    made += hbao(radius, slices=[2, 3], steps=[6, 12], half_resolution=True)
     return _by_cost(made + hbao(radius, slices=3, steps=6, denoise=1))
 
 
@@ -124,16 +128,21 @@ def technique_of(module: AmbientVisibility) -> str:
 
 def estimated_cost(module: AmbientVisibility) -> float:
     """Image reads a pixel: what speed follows before anything is timed. Only its order is used."""
-    technique, choices = technique_of(module), module.config()
-    filtered = float(DENOISE_TAPS * choices.get("denoise", 0))
+    choices = module.config()
+    reads = _taps(technique_of(module), choices) + DENOISE_TAPS * choices.get("denoise", 0)
+    return reads / 4 + UPSAMPLE_TAPS if choices.get("half_resolution") else reads
+
+
+def _taps(technique: str, choices: Mapping[str, Any]) -> float:
     if technique == "statvo":  # each layer builds its tables, then each window looks up corners
         corners = 9 if choices["quadrants"] else 4
         return float(choices["layers"]) * (corners * choices["windows"] + 4 / choices["sat_scale"] ** 2)
     if technique == "hbao":
-        return float(2 * choices["slices"] * choices["steps"]) + filtered
+        return float(2 * choices["slices"] * choices["steps"])
     if technique == "ray_march":
-        return float(choices["rays"] * choices["steps"]) + filtered
-    return math.prod(float(value) for value in choices.values() if _is_count(value) and value > 0)
+        return float(choices["rays"] * choices["steps"])
+    counts = [float(value) for name, value in choices.items() if name != "denoise" and _is_count(value) and value > 0]
+    return math.prod(counts)
 
 
 def distance(one: AmbientVisibility, other: AmbientVisibility) -> float:

@@ -13,6 +13,7 @@ from typing import Any, final
 from torch_ssao import checks
 from torch_ssao.fitting.candidates import Candidate, distance
 from torch_ssao.fitting.fit import fit
+from torch_ssao.fitting.interrupts import remembered_interrupts
 from torch_ssao.fitting.problem import Problem, rmse
 from torch_ssao.fitting.result import FitResult
 from torch_ssao.fitting.store import Store, key_of
@@ -90,15 +91,18 @@ def fit_chain(
     data = "" if store.folder is None else problem.fingerprint()
     arguments = problem.arguments()
     rows: list[Row] = []
-    for candidate in candidates:
-        try:
-            row = _fitted(candidate, rows, problem, arguments, plan, store, data)
-        except checks.MissingExtraError:  # not the candidate's fault, and all others would say the same
-            raise
-        except Exception as error:
-            row = failed(candidate.name, candidate.module, error)
-        rows.append(row)
-        on_row(row)
+    with remembered_interrupts() as check_interrupted:
+        for candidate in candidates:
+            try:
+                row = _fitted(candidate, rows, problem, arguments, plan, store, data)
+            except checks.MissingExtraError:  # not the candidate's fault, and all others would say the same
+                raise
+            except Exception as error:
+                check_interrupted()  # an interrupt in disguise is not the candidate's fault either
+                row = failed(candidate.name, candidate.module, error)
+            rows.append(row)
+            on_row(row)
+            check_interrupted()
     return rows
 
 

@@ -217,7 +217,7 @@ def _split(sights: tuple[Sight, ...], validation: Any, count: int) -> tuple[tupl
 
 
 def _indices(validation: Any, count: int) -> set[int]:
-    plain = validation.tolist() if isinstance(validation, Tensor) else validation
+    plain = validation.tolist() if hasattr(validation, "tolist") else validation  # arrays and tensors
     listed = [plain] if isinstance(plain, int) else list(plain) if isinstance(plain, Iterable) else [plain]
     for index in listed:
         checks.check_count("validation", index, 0, count - 1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 import threading
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -118,8 +118,9 @@ def sweep(
     tasks = [(name, problem, shared, options, _folder_of(store, name)) for name, problem in given.items()]
     found: dict[str, _Fitted] = {}
     try:
-        with Bar("scenes", len(tasks), "scene", progress) as bar:
-            for name, fitted in _parallel(tasks, n_jobs, backend):
+        running = _parallel(tasks, n_jobs, backend)
+        with Bar("scenes", len(tasks), "scene", progress) as bar, closing(running):  # an interrupt ends the tasks left
+            for name, fitted in running:
                 found[name] = fitted
                 bar.update(name)
         return _conclude({name: found[name] for name in given}, target_rmse, budget_ms, timer)
@@ -171,7 +172,9 @@ def fit_scene(name: str, problem: Any, shared: Any, options: _Options, folder: P
     return name, _Fitted(rows, checked.validation[0].gbuffer, checked.judged_on_training_views, notes)
 
 
-def _parallel(tasks: Sequence[Any], n_jobs: int | None, backend: str | None) -> Iterator[tuple[str, _Fitted]]:
+def _parallel(
+    tasks: Sequence[Any], n_jobs: int | None, backend: str | None
+) -> Generator[tuple[str, _Fitted], None, None]:
     """Results in the order in which they are done."""
     try:
         import joblib
