@@ -50,8 +50,15 @@ def save(module: AmbientVisibility, path: str | Path) -> None:
     path = Path(path)
     checks.check_output_folder("path", path.parent)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
-    partial.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    os.replace(partial, path)
+    try:
+        partial.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        reason = error.strerror or error
+        raise checks.OutputError(
+            f"path {str(path)!r} cannot be written ({reason}): make room or pass another path"
+        ) from error
 
 
 def load(path: str | Path) -> AmbientVisibility:

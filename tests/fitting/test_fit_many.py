@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -199,3 +200,14 @@ def test_a_bad_view_is_named_and_an_empty_one_is_left_out() -> None:
     empty[1] = False
     result = fit(module(), gb, spoiled, valid=empty, parameters="contrast")
     assert result.rmse < 0.1
+
+
+def test_fits_in_threads_take_turns() -> None:
+    gb, wanted = SCENES[0], targets()[0]
+
+    def run(_: int) -> dict[str, float]:
+        return fit(module(0.4), gb, wanted, parameters=("falloff", "contrast"), max_evaluations=20).values
+
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(run, range(4)))
+    assert all(values == run(0) for values in found)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from torch_ssao.modules import AmbientVisibility
 
 BUDGET = {1: 60, 2: 100, 3: 180}  # evaluations by number of parameters: scan, descents and polish
 BUDGET_MANY = 700
+_TURNS = threading.RLock()  # torch's forward-mode levels belong to the process: fits in threads must not overlap
 
 
 def fit(
@@ -86,6 +88,7 @@ def fit(
     Raises: ShapeError; RangeError for targets that are not finite, weights below 0, no pixel to fit, or starting
         values out of range; ChoiceError for unknown names; MissingExtraError without optimistix.
     Cost: `evaluations` forward passes of all views (a Jacobian column costs about one and a half); memory one view at a time.
+        Fits in several threads take turns: use processes, or `sweep`.
     Source: Marquardt 1963, Powell 1970 (dogleg), Nocedal and Wright 2006 (BFGS); the scan is a Sobol sequence over factors of
         1/8 to 8.
     """
@@ -96,7 +99,7 @@ def fit(
     plan = _Plan.of(loss, loss_scale, solver, weights is not None)
     budget = _budget(max_evaluations, len(space))
     began = time.perf_counter()
-    with _Bar(budget, progress) as bar:
+    with _TURNS, _Bar(budget, progress) as bar:
         searching = budget - (
             len(space) if plan.has_squares else 0
         )  # the Jacobian of the standard errors is paid for too
@@ -112,7 +115,7 @@ def fit(
         )
         batches = None if batch is None else _batches(len(views), batch, seed)
         found = _run(residuals, plan, batches, with_scan=scan)
-    return _conclude(residuals, plan, found, time.perf_counter() - began)
+        return _conclude(residuals, plan, found, time.perf_counter() - began)
 
 
 @final

@@ -146,7 +146,8 @@ class _Text:
         if least is None:
             return f"{self._figures(best)}, has the least {self.judged} of the candidates that take at most {self.budget:g} ms."
         if best is least:
-            return f"{self._figures(best)}, has the least {self.judged} of all, and no cheaper one comes close."
+            others = any(row.ms < best.ms for row in self.rows)
+            return f"{self._figures(best)}, has the least {self.judged} of all{', and no cheaper one comes close' * others}."
         gap = best.validation_rmse - least.validation_rmse
         return (
             f"{self._figures(best)}, is the cheapest candidate that cannot be told from the best, {self._figures(least)}: "
