@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from torch_ssao.report.measure import Measurement
 
 UNTUNED, FITTED = "#b4552d", "#1f6f8b"
+CROWDED = 14
+"""Rows beyond which only those on the front, and the one chosen, are named in the plot; the table names all."""
 PEER, FRONT = "0.25", "#e0a83c"
 COLOURS, MARKERS = ("#1f6f8b", "#b4552d", "#6b7f1f", "#7b4b94"), ("o", "s", "^", "D")
 """Of techniques in the order of the report."""
@@ -29,6 +31,7 @@ def speed_error_png(measurement: Measurement) -> bytes:
     several = len(measurement.techniques) > 1
     figure = Figure(figsize=(8.4, 5.6) if several else (7.0, 4.6), dpi=120, layout="constrained")
     axes = figure.add_subplot()
+    named = _named(measurement)
     for index, technique in enumerate(measurement.techniques):
         marker, own = MARKERS[index % len(MARKERS)], COLOURS[index % len(COLOURS)]
         for fitted in (False, True):
@@ -42,7 +45,8 @@ def speed_error_png(measurement: Measurement) -> bytes:
             style |= {"label": f"{TITLES.get(technique, technique)}, {state}" if several else state}
             _draw_rows(axes, rows, style)
             for row in rows:
-                _annotate(axes, row, measurement, colour)
+                if row in named:
+                    _annotate(axes, row, measurement, colour)
     _draw_peers(axes, measurement)
     _draw_front(axes, measurement)
     constant, ceiling = measurement.constant.validation.rmse, measurement.ceiling.rmse
@@ -77,7 +81,8 @@ def _draw_peers(axes: Any, measurement: Measurement) -> None:
         style |= {"color": PEER, "label": "peer" if index == 0 else None, "zorder": 3}
         axes.errorbar(timing.median_ms, error, xerr=bars, **style)
         label: dict[str, Any] = {
-            "ha": "center",
+            "ha": "left",
+            "va": "center",
             "fontsize": 8,
             "color": PEER,
             "textcoords": "offset points",
@@ -92,6 +97,15 @@ def _draw_front(axes: Any, measurement: Measurement) -> None:
     times, errors = zip(*front, strict=True)
     style: dict[str, Any] = {"color": FRONT, "linewidth": 5.0, "alpha": 0.35, "zorder": 2, "label": "Pareto front"}
     axes.step(times, errors, where="post", marker="o", markersize=15, markeredgewidth=0, **style)
+
+
+def _named(measurement: Measurement) -> list[Any]:
+    """The rows that are named in the plot."""
+    if len(measurement.rows) <= CROWDED:
+        return list(measurement.rows)
+    chosen = measurement.chosen
+    picked = [row for row in measurement.rows if chosen is not None and row.is_fitted and row.name == chosen.name]
+    return [*pareto_front(measurement), *picked]
 
 
 def _annotate(axes: Any, row: Row, measurement: Measurement, colour: str) -> None:
