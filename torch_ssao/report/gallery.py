@@ -10,7 +10,7 @@ from torch_ssao.report import markup, tables
 from torch_ssao.report.rows import Row
 
 if TYPE_CHECKING:
-    from torch_ssao.report.measure import Measurement
+    from torch_ssao.report.measurement import Measurement
 
 HELP = (
     "Drag the dividers, or reach them with the Tab key and move them with the arrow keys, Page Up, Page Down, Home and End. "

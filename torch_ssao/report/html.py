@@ -16,7 +16,7 @@ from torch_ssao.report.pareto import entries, is_on, pareto_front
 from torch_ssao.report.rows import Row
 
 if TYPE_CHECKING:
-    from torch_ssao.report.measure import Measurement
+    from torch_ssao.report.measurement import Measurement
 
 
 def page(measurement: Measurement, pictures: Mapping[str, bytes]) -> str:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 from torch_ssao.report import html, images, overview, plots
 from torch_ssao.report.candidates import LAYERS
 from torch_ssao.report.environment import require
-from torch_ssao.report.measure import Measurement, measure, write_json
+from torch_ssao.report.measure import measure, write_json
+from torch_ssao.report.measurement import Measurement
 from torch_ssao.report.rows import REPEATS, predict
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from torch_ssao.report.images import ERROR_COLOURS, ERROR_SPAN, figure_png
 from torch_ssao.report.rows import Row, predict
 
 if TYPE_CHECKING:
-    from torch_ssao.report.measure import Measurement
+    from torch_ssao.report.measurement import Measurement
 
 DPI = 100
 GAP, HEAD = 8, 34

@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from torch_ssao.report.peers import Peer
 from torch_ssao.report.rows import Row
 
-if TYPE_CHECKING:
-    from torch_ssao.report.measure import Measurement
-
 Entry = Row | Peer
 
 
-def entries(measurement: Measurement) -> list[Entry]:
+class Compared(Protocol):
+    """What was measured here, and by others."""
+
+    @property
+    def rows(self) -> tuple[Row, ...]: ...
+
+    @property
+    def peers(self) -> tuple[Peer, ...]: ...
+
+
+def entries(measurement: Compared) -> list[Entry]:
     """Everything with an error and, but for some peers, a time: ours, then the peers."""
     return [*measurement.rows, *measurement.peers]
 
 
-def pareto_front(measurement: Measurement) -> list[Entry]:
+def pareto_front(measurement: Compared) -> list[Entry]:
     """The entries that no other beats in both validation RMSE and median time, cheapest first; of equals the first.
 
     A module does the same work untuned and fitted, so that only noise tells their times apart: of the two the one of less
@@ -34,7 +41,7 @@ def pareto_front(measurement: Measurement) -> list[Entry]:
     return front
 
 
-def _competing(measurement: Measurement) -> list[Entry]:
+def _competing(measurement: Compared) -> list[Entry]:
     better: dict[str, Row] = {}
     for row in sorted(measurement.rows, key=lambda row: (row.validation.rmse, not row.is_fitted)):
         better.setdefault(row.name, row)

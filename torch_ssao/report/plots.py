@@ -11,7 +11,7 @@ from torch_ssao.report.pareto import entries, pareto_front
 from torch_ssao.report.rows import Row
 
 if TYPE_CHECKING:
-    from torch_ssao.report.measure import Measurement
+    from torch_ssao.report.measurement import Measurement
 
 UNTUNED, FITTED = "#b4552d", "#1f6f8b"
 CROWDED = 14

@@ -12,7 +12,7 @@ from torch_ssao.report.peers import Peer
 from torch_ssao.report.rows import Score, Timing
 
 if TYPE_CHECKING:
-    from torch_ssao.report.measure import Measurement
+    from torch_ssao.report.measurement import Measurement
 
 _METRICS = ("rmse", "psnr", "ssim")
 _TIMES = ("ms", "ms_low", "ms_high")

@@ -12,7 +12,7 @@ from torch_ssao.report.rows import Row, Score, Timing
 from torch_ssao.report.truth import Ceiling
 
 if TYPE_CHECKING:
-    from torch_ssao.report.measure import Measurement
+    from torch_ssao.report.measurement import Measurement
 
 ON_FRONT = "*"
 VALUE_COLUMNS = ("model", "parameter", "value", "standard error", "meaning")
