@@ -34,6 +34,7 @@ OPTIONS = (
     "offscreen",
     "thickness",
     "denoise",
+    "half_resolution",
 )
 
 
@@ -66,6 +67,7 @@ def add_options(parser: argparse.ArgumentParser, count: Callable[[str], Any], me
     )
     add("thickness", text, type=_thickness, metavar="T")
     add("denoise", "passes of the edge-aware filter", type=int, metavar="N")
+    add("half_resolution", "compute every other row and column, carry them to the rest along surfaces", action=both)
 
 
 def parse_names(text: str) -> tuple[str, ...]:

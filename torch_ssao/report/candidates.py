@@ -6,15 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torch_ssao import checks
+from torch_ssao.fitting.candidates import COUNTS
 from torch_ssao.modules import TECHNIQUES, AmbientVisibility
 
 LAYERS = (1, 2, 4, 8)
-COUNTS: dict[str, tuple[str, ...]] = {
-    "statvo": ("layers",),
-    "hbao": ("slices", "steps"),
-    "ray_march": ("rays", "steps"),
-}
-"""The counts of each technique that speed and error depend on."""
 SWEEPS: dict[str, tuple[tuple[int, ...], ...]] = {"hbao": ((2, 4), (3, 6)), "ray_march": ((16, 8),)}
 """Counts that are measured where none are given; `LAYERS` for techniques with layers."""
 FINE_SWEEPS: dict[str, tuple[tuple[int, ...], ...]] = {

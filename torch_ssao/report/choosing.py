@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
+from torch_ssao.fitting.candidates import COUNTS
 from torch_ssao.fitting.timing import Timing, time_forward
 from torch_ssao.gbuffer import GBuffer
 from torch_ssao.modules import AmbientVisibility
-from torch_ssao.report.candidates import COUNTS, TITLES
+from torch_ssao.report.candidates import TITLES
 from torch_ssao.report.rows import FitSummary
 from torch_ssao.report.truth import Truth
 
