@@ -17,7 +17,7 @@ SHORT = {  # few taps and four times as many, at a block as small beside the ima
 
 @pytest.mark.parametrize("name", SHORT)
 def test_twenty_gbuffers_whatever_the_taps(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    monkeypatch.setitem(ts.ops.ray_march._TAPS_AT_ONCE, "cpu", 2**12)
+    monkeypatch.setitem(ts.ops.ray_march._TAPS_AT_ONCE, "cpu", 2**14)  # derivatives take an eighth or half
     monkeypatch.setitem(ts.ops.horizon.BLOCK, "cpu", 2**12)
     rows = {f"{name} {n}": (4 * n * n, lambda n=n: SHORT[name](n)) for n in (1, 2)}
     monkeypatch.setattr(memory, "ROWS", rows)
