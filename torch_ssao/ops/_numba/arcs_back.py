@@ -208,9 +208,7 @@ def link_arc(
         hit = hit & same
         near_x, near_y = from_along + first * across, from_towards + first * rise
         far_x, far_y = from_along + last * across, from_towards + last * rise
-        near, near_above = a.amount_at(
-            near_x, near_y, facing, turned, length, noise, bias_cosine, bias_sine, -one, by_cosine
-        )
+        near, _ = a.amount_at(near_x, near_y, facing, turned, length, noise, bias_cosine, bias_sine, -one, by_cosine)
         far, _ = a.amount_at(far_x, far_y, facing, turned, length, noise, bias_cosine, bias_sine, -one, by_cosine)
         lower = start | (near <= far)
         to_near, to_far = (ends[p], ends[P + p]) if lower else (ends[P + p], ends[p])

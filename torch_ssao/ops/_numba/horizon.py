@@ -11,16 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_ssao.ops._numba import taps_back
 from torch_ssao.ops._numba import horizon_rows as rows
+from torch_ssao.ops._numba import taps_back
 from torch_ssao.ops._numba.pool import run_blocks
 from torch_ssao.ops.depth_pyramid import build_pyramid
 from torch_ssao.ops.horizon_taps import Layout
 from torch_ssao.ops.recompute import Kernel, Outputs
 
-BLOCKS = (
-    16  # of the rows of an image, whatever the number of threads: it sets the order in which derivatives are added up
-)
+BLOCKS = 16  # of an image's rows, for any number of threads: the order in which derivatives are added up
 
 
 class HorizonLoops(NamedTuple):
@@ -96,7 +94,8 @@ class _Images:
 
     def __init__(self, kernel: HorizonLoops, tensors: Sequence[Tensor | None]) -> None:
         planes, valid, normal, intrinsics, radius, falloff, thickness, bias = tensors
-        batch, height, width = self.shape = tuple(valid.shape)  # type: ignore[union-attr]
+        self.shape = tuple(valid.shape)  # type: ignore[union-attr]
+        batch, height, _ = self.shape
         self.kernel, layout = kernel, kernel.layout
         self.texels = _texels(planes, valid)  # type: ignore[arg-type]
         self.dtype = self.texels.dtype

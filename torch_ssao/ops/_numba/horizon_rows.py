@@ -172,18 +172,20 @@ def take_back_slices(
 @njit(**OPTIONS)
 def rows_pull_back(
     cotangent: Any, to_texels: Any, reached: Any, to_normal: Any, to_image: Any, texels: Any, normal: Any, rotation: Any,
-    offset: Any, image: Any, network: Any, pyramid: Any, form: Any, step_power: float, step: float, first_row: int, last_row: int,
+    offset: Any, image: Any, network: Any, pyramid: Any, form: Any, step_power: float, step: float, first_row: int,
+    last_row: int,
 ) -> None:  # fmt: skip
     """Add the cotangents of some rows of an image: `rows_value` names the arguments.
 
     Args:
-        cotangent: (H, W). to_texels: (3 H W), of which the pixels `reached` (first, last) may be written to. to_normal: (3, H, W). to_image: (8) float64.
+        cotangent: (H, W). to_texels: (3 H W), of which the pixels from reached[0] to reached[1], set here, are written to.
+        to_normal: (3, H, W). to_image: (8) float64.
         step: of the footprint, over which its effect is differenced; 0: not at all.
     """
     height, width = cotangent.shape
     T = cotangent.dtype.type
     work = scratch(cotangent, form)
-    frame, taps, _, sums, _ = work
+    frame, _, _, sums, _ = work
     pixel, side_sums = np.zeros(ab.PIXEL_ROWS * P, cotangent.dtype), np.zeros(ab.SIDE_ROWS * P, cotangent.dtype)
     ends, change = np.zeros((2 * form[STEPS], 2 * P), cotangent.dtype), np.zeros(P, cotangent.dtype)
     share, ortho = T(1) / T(form[SLICES]), form[ORTHO] != 0

@@ -118,7 +118,7 @@ def set_pixels(
     share_x = half if fx == fy else (one if fx > fy else zero)
     longest_px = image[t.LONGEST_PX]
     for p in range(min(P, width - first)):
-        x, y, depth, far = frame[t.X * P + p], frame[t.Y * P + p], frame[t.DEPTH * P + p], frame[t.FAR * P + p]
+        x, y, depth = frame[t.X * P + p], frame[t.Y * P + p], frame[t.DEPTH * P + p]
         stretch = one if ortho else math.sqrt(one + x * x + y * y)
         a, b_, c = x / stretch, y / stretch, one / stretch
         to_facing, to_far = pixel[b.FACING * P + p], pixel[b.FAR * P + p]
