@@ -17,11 +17,11 @@ from torch_ssao.ops.horizon_arcs import CONNECTED_SLOPE, GRAZE, LINK_STEP, TRAPE
 
 P = LANES
 # Rows of `sums`, of a side of a slice: the share below the bias, what is added up, how far it has got.
-FLOOR, TOTAL, REACHED = range(3)
-SUM_ROWS = 3
+FLOOR, TOTAL, REACHED = range(0, 3 * P, P)
+SUM_SIZE = 3 * P
 # Rows of an arc; PLACE is where it was before sorting (increments: the tap's weight), BEFORE how far the earlier ones reach.
-LOW, HIGH, PLACE, BEFORE, TO_LOW, TO_HIGH = range(6)
-ARC_ROWS = 6
+LOW, HIGH, PLACE, BEFORE, TO_LOW, TO_HIGH = range(0, 6 * P, P)
+ARC_SIZE = 6 * P
 
 
 @njit(forceinline=True, **OPTIONS)
@@ -75,10 +75,10 @@ def set_side(frame: Any, sums: Any, image: Any, sign: float, by_cosine: bool) ->
     """Share below the bias; nothing added up yet."""
     T = sums.dtype.type
     bias, side = image[t.BIAS], T(sign)
-    sine, cosine = math.sin(bias), math.cos(bias)
+    sine, cosine = image[t.BIAS_SINE], image[t.BIAS_COSINE]
     for p in range(P):
-        facing, turned, length = frame[t.FACING * P + p], side * frame[t.TURNED * P + p], frame[t.LENGTH * P + p]
-        sums[FLOOR * P + p] = amount(bias, sine, cosine, facing, turned, length, by_cosine)
+        facing, turned, length = frame[t.FACING + p], side * frame[t.TURNED + p], frame[t.LENGTH + p]
+        sums[FLOOR + p] = amount(bias, sine, cosine, facing, turned, length, by_cosine)
 
 
 @njit(**OPTIONS)
@@ -88,12 +88,12 @@ def tap_arc(
     """Arc that the occluder of tap k covers inside the sphere."""
     T = sums.dtype.type
     side = T(sign)
-    thickness, bias_cosine, bias_sine = image[t.THICKNESS], math.cos(image[t.BIAS]), math.sin(image[t.BIAS])
+    thickness, bias_cosine, bias_sine = image[t.THICKNESS], image[t.BIAS_COSINE], image[t.BIAS_SINE]
     for p in range(P):
-        along, towards = tap[t.ALONG * P + p], tap[t.TOWARDS * P + p]
-        facing, turned, length = frame[t.FACING * P + p], side * frame[t.TURNED * P + p], frame[t.LENGTH * P + p]
-        noise, floor, radius = frame[t.NOISE * P + p], sums[FLOOR * P + p], frame[t.RADIUS * P + p]
-        ray_x, ray_y = view_ray(tap[t.REACH * P + p], frame[t.FAR * P + p], ortho)
+        along, towards = tap[t.ALONG + p], tap[t.TOWARDS + p]
+        facing, turned, length = frame[t.FACING + p], side * frame[t.TURNED + p], frame[t.LENGTH + p]
+        noise, floor, radius = frame[t.NOISE + p], sums[FLOOR + p], frame[t.RADIUS + p]
+        ray_x, ray_y = view_ray(tap[t.REACH + p], frame[t.FAR + p], ortho)
         first, last, hit = clip(along, towards, ray_x, ray_y, radius, thickness * radius)
         high, _ = amount_at(
             along + first * ray_x, towards + first * ray_y, facing, turned, length, noise,
@@ -103,11 +103,11 @@ def tap_arc(
             along + last * ray_x, towards + last * ray_y, facing, turned, length, noise,
             bias_cosine, bias_sine, floor, by_cosine,
         )  # fmt: skip
-        hit = hit & (tap[t.SEEN * P + p] > T(0))
+        hit = hit & (tap[t.SEEN + p] > T(0))
         high = high if hit else floor
-        arc[HIGH * P + p] = high
-        arc[LOW * P + p] = min(low, high) if hit else floor
-        arc[PLACE * P + p] = T(place)
+        arc[HIGH + p] = high
+        arc[LOW + p] = min(low, high) if hit else floor
+        arc[PLACE + p] = T(place)
 
 
 @njit(forceinline=True, **OPTIONS)
@@ -138,17 +138,17 @@ def link_arc(
     T = sums.dtype.type
     side = T(sign)
     step, slope = min(image[t.THICKNESS], T(LINK_STEP)), T(CONNECTED_SLOPE)
-    bias_cosine, bias_sine = math.cos(image[t.BIAS]), math.sin(image[t.BIAS])
+    bias_cosine, bias_sine = image[t.BIAS_COSINE], image[t.BIAS_SINE]
     one, zero = T(1), T(0)
     for p in range(P):
-        along, towards = tap[t.ALONG * P + p], tap[t.TOWARDS * P + p]
-        from_along = zero if start else before[t.ALONG * P + p]
-        from_towards = zero if start else before[t.TOWARDS * P + p]
-        seen_before = one if start else before[t.SEEN * P + p]
-        facing, turned, length = frame[t.FACING * P + p], side * frame[t.TURNED * P + p], frame[t.LENGTH * P + p]
-        noise, floor, radius = frame[t.NOISE * P + p], sums[FLOOR * P + p], frame[t.RADIUS * P + p]
+        along, towards = tap[t.ALONG + p], tap[t.TOWARDS + p]
+        from_along = zero if start else before[t.ALONG + p]
+        from_towards = zero if start else before[t.TOWARDS + p]
+        seen_before = one if start else before[t.SEEN + p]
+        facing, turned, length = frame[t.FACING + p], side * frame[t.TURNED + p], frame[t.LENGTH + p]
+        noise, floor, radius = frame[t.NOISE + p], sums[FLOOR + p], frame[t.RADIUS + p]
         across, rise = along - from_along, towards - from_towards
-        same = joined(across, rise, tap[t.SEEN * P + p], seen_before, slope, step * radius, True)
+        same = joined(across, rise, tap[t.SEEN + p], seen_before, slope, step * radius, True)
         span = math.sqrt(across * across + rise * rise)
         across, rise = across / span, rise / span
         first, last, hit = clip(from_along, from_towards, across, rise, radius, span)
@@ -162,9 +162,9 @@ def link_arc(
         )  # fmt: skip
         other = floor if start else other
         hit = hit & same
-        arc[HIGH * P + p] = max(two, other) if hit else floor
-        arc[LOW * P + p] = min(two, other) if hit else floor
-        arc[PLACE * P + p] = T(place)
+        arc[HIGH + p] = max(two, other) if hit else floor
+        arc[LOW + p] = min(two, other) if hit else floor
+        arc[PLACE + p] = T(place)
 
 
 @njit(**OPTIONS)
@@ -173,16 +173,16 @@ def sort_arcs(arcs: Any, network: Any) -> None:
     for pair in range(network.shape[0]):
         one, two = arcs[network[pair, 0]], arcs[network[pair, 1]]
         for p in range(P):
-            low, low_two = one[LOW * P + p], two[LOW * P + p]
-            high, high_two = one[HIGH * P + p], two[HIGH * P + p]
-            place, place_two = one[PLACE * P + p], two[PLACE * P + p]
+            low, low_two = one[LOW + p], two[LOW + p]
+            high, high_two = one[HIGH + p], two[HIGH + p]
+            place, place_two = one[PLACE + p], two[PLACE + p]
             swap = low > low_two
-            one[LOW * P + p] = low_two if swap else low
-            two[LOW * P + p] = low if swap else low_two
-            one[HIGH * P + p] = high_two if swap else high
-            two[HIGH * P + p] = high if swap else high_two
-            one[PLACE * P + p] = place_two if swap else place
-            two[PLACE * P + p] = place if swap else place_two
+            one[LOW + p] = low_two if swap else low
+            two[LOW + p] = low if swap else low_two
+            one[HIGH + p] = high_two if swap else high
+            two[HIGH + p] = high if swap else high_two
+            one[PLACE + p] = place_two if swap else place
+            two[PLACE + p] = place if swap else place_two
 
 
 @njit(**OPTIONS)
@@ -190,15 +190,15 @@ def unite(arcs: Any, sums: Any, count: int) -> None:
     """Add the length of the union of sorted arcs."""
     first = arcs[0]
     for p in range(P):
-        sums[REACHED * P + p] = first[LOW * P + p]
+        sums[REACHED + p] = first[LOW + p]
     for i in range(count):
         arc = arcs[i]
         for p in range(P):
-            reached, high = sums[REACHED * P + p], arc[HIGH * P + p]
-            arc[BEFORE * P + p] = reached
-            low = max(arc[LOW * P + p], reached)
-            sums[TOTAL * P + p] += max(high - low, type(high)(0))
-            sums[REACHED * P + p] = max(reached, high)
+            reached, high = sums[REACHED + p], arc[HIGH + p]
+            arc[BEFORE + p] = reached
+            low = max(arc[LOW + p], reached)
+            sums[TOTAL + p] += max(high - low, type(high)(0))
+            sums[REACHED + p] = max(reached, high)
 
 
 @njit(**OPTIONS)
@@ -207,9 +207,9 @@ def weigh_tap(frame: Any, tap: Any, arc: Any, image: Any) -> None:
     T = frame.dtype.type
     falloff, one, zero = image[t.FALLOFF], T(1), T(0)
     for p in range(P):
-        along, towards = tap[t.ALONG * P + p], tap[t.TOWARDS * P + p]
-        distance = math.sqrt(along * along + towards * towards) / frame[t.RADIUS * P + p]
-        arc[PLACE * P + p] = one - power(distance, falloff) if distance < one else zero
+        along, towards = tap[t.ALONG + p], tap[t.TOWARDS + p]
+        distance = math.sqrt(along * along + towards * towards) / frame[t.RADIUS + p]
+        arc[PLACE + p] = one - power(distance, falloff) if distance < one else zero
 
 
 @njit(**OPTIONS)
@@ -229,29 +229,29 @@ def raise_horizon(
     """Add by how much tap k raises the horizon (row REACHED); its arc goes from where it starts to the horizon."""
     T = sums.dtype.type
     side = T(sign)
-    thickness, bias_cosine, bias_sine = image[t.THICKNESS], math.cos(image[t.BIAS]), math.sin(image[t.BIAS])
+    thickness, bias_cosine, bias_sine = image[t.THICKNESS], image[t.BIAS_COSINE], image[t.BIAS_SINE]
     slope, step, one, zero, half = T(TRAPEZOID_SLOPE), T(TRAPEZOID_STEP), T(1), T(0), T(0.5)
     thick = thickness < T(np.inf)
     for p in range(P):
-        along, towards = tap[t.ALONG * P + p], tap[t.TOWARDS * P + p]
-        facing, turned, length = frame[t.FACING * P + p], side * frame[t.TURNED * P + p], frame[t.LENGTH * P + p]
-        noise, floor, radius = frame[t.NOISE * P + p], sums[FLOOR * P + p], frame[t.RADIUS * P + p]
-        across = along - (zero if start else before[t.ALONG * P + p])
-        rise = towards - (zero if start else before[t.TOWARDS * P + p])
-        seen, seen_before = tap[t.SEEN * P + p], one if start else before[t.SEEN * P + p]
+        along, towards = tap[t.ALONG + p], tap[t.TOWARDS + p]
+        facing, turned, length = frame[t.FACING + p], side * frame[t.TURNED + p], frame[t.LENGTH + p]
+        noise, floor, radius = frame[t.NOISE + p], sums[FLOOR + p], frame[t.RADIUS + p]
+        across = along - (zero if start else before[t.ALONG + p])
+        rise = towards - (zero if start else before[t.TOWARDS + p])
+        seen, seen_before = tap[t.SEEN + p], one if start else before[t.SEEN + p]
         same = joined(across, rise, seen, seen_before, slope, step * radius, False)
-        weight = arc[PLACE * P + p]
-        earlier = one if start else arc_before[PLACE * P + p]
+        weight = arc[PLACE + p]
+        earlier = one if start else arc_before[PLACE + p]
         front, _ = amount_at(along, towards, facing, turned, length, noise, bias_cosine, bias_sine, floor, by_cosine)
-        reached = floor if start else sums[REACHED * P + p]
+        reached = floor if start else sums[REACHED + p]
         horizon = max(reached, front) if seen > zero else reached
-        ray_x, ray_y = view_ray(tap[t.REACH * P + p], frame[t.FAR * P + p], ortho)
+        ray_x, ray_y = view_ray(tap[t.REACH + p], frame[t.FAR + p], ortho)
         depth = thickness * radius if thick else zero
         back, _ = amount_at(
             along + depth * ray_x, towards + depth * ray_y, facing, turned, length, noise,
             bias_cosine, bias_sine, floor, by_cosine,
         )  # fmt: skip
         low = min(max(reached, back), horizon) if thick else reached
-        arc[LOW * P + p], arc[HIGH * P + p], arc[BEFORE * P + p] = low, horizon, reached
-        sums[TOTAL * P + p] += half * ((earlier if same else weight) + weight) * (horizon - low)
-        sums[REACHED * P + p] = horizon
+        arc[LOW + p], arc[HIGH + p], arc[BEFORE + p] = low, horizon, reached
+        sums[TOTAL + p] += half * ((earlier if same else weight) + weight) * (horizon - low)
+        sums[REACHED + p] = horizon

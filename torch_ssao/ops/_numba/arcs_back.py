@@ -20,12 +20,12 @@ from torch_ssao.ops.horizon_arcs import CONNECTED_SLOPE, GRAZE, LINK_STEP, TRAPE
 
 P = LANES
 # Rows of `side`, of a side of a slice: cotangents of the normal at given elevations, of the view angle, and of the floor.
-TO_FACING, TO_TURNED, TO_VIEW, TO_FLOOR, CARRY = range(5)
-SIDE_ROWS = 5
+TO_FACING, TO_TURNED, TO_VIEW, TO_FLOOR, CARRY = range(0, 5 * P, P)
+SIDE_SIZE = 5 * P
 # Rows of `pixel`: cotangents of a pixel's numbers, and of one slice's (from TURNED on); COT is that of its obscurance.
-COT, FACING, FAR, DEPTH, RADIUS, THICKNESS, BIAS, FALLOFF, NX, NY, NZ, A, B, C, FX, FY, TO_X, TO_Y = range(18)
-TURNED, STEP_X, STEP_Y, RECESSION = range(18, 22)
-PIXEL_ROWS = 22
+COT, FACING, FAR, DEPTH, RADIUS, THICKNESS, BIAS, FALLOFF, NX, NY, NZ, A, B, C, FX, FY, TO_X, TO_Y = range(0, 18 * P, P)
+TURNED, STEP_X, STEP_Y, RECESSION = range(18 * P, 22 * P, P)
+PIXEL_SIZE = 22 * P
 
 
 @njit(forceinline=True, **OPTIONS)
@@ -105,7 +105,7 @@ def clear_taps(taps: Any) -> None:
     for k in range(taps.shape[0]):
         tap = taps[k]
         for p in range(P):
-            tap[t.TO_ALONG * P + p] = tap[t.TO_TOWARDS * P + p] = tap[t.TO_REACH * P + p] = taps.dtype.type(0)
+            tap[t.TO_ALONG + p] = tap[t.TO_TOWARDS + p] = tap[t.TO_REACH + p] = taps.dtype.type(0)
 
 
 @njit(**OPTIONS)
@@ -114,17 +114,17 @@ def unite(arcs: Any, pixel: Any, side: Any, count: int) -> None:
     T = pixel.dtype.type
     zero, one = T(0), T(1)
     for p in range(P):
-        side[CARRY * P + p] = one
+        side[CARRY + p] = one
     for i in range(count - 1, -1, -1):
         arc = arcs[i]
         for p in range(P):
-            cot, last = pixel[COT * P + p], side[CARRY * P + p]
-            low, high, reached = arc[a.LOW * P + p], arc[a.HIGH * P + p], arc[a.BEFORE * P + p]
+            cot, last = pixel[COT + p], side[CARRY + p]
+            low, high, reached = arc[a.LOW + p], arc[a.HIGH + p], arc[a.BEFORE + p]
             further = high > reached
             begins = further & (low >= reached)
-            arc[a.TO_HIGH * P + p] = cot * last if further else zero
-            arc[a.TO_LOW * P + p] = -cot if begins else zero
-            side[CARRY * P + p] = one if begins else (zero if further else last)
+            arc[a.TO_HIGH + p] = cot * last if further else zero
+            arc[a.TO_LOW + p] = -cot if begins else zero
+            side[CARRY + p] = one if begins else (zero if further else last)
 
 
 @njit(**OPTIONS)
@@ -133,9 +133,9 @@ def sort_arcs(arcs: Any, ends: Any, count: int) -> None:
     for i in range(count):
         arc = arcs[i]
         for p in range(P):
-            place = np.intp(arc[a.PLACE * P + p])
-            ends[place, p] = arc[a.TO_LOW * P + p]
-            ends[place, P + p] = arc[a.TO_HIGH * P + p]
+            place = np.intp(arc[a.PLACE + p])
+            ends[place, p] = arc[a.TO_LOW + p]
+            ends[place, P + p] = arc[a.TO_HIGH + p]
 
 
 @njit(**OPTIONS)
@@ -144,18 +144,18 @@ def tap_arc(
 ) -> None:
     T = pixel.dtype.type
     hand, thickness = T(sign), image[t.THICKNESS]
-    bias_cosine, bias_sine = math.cos(image[t.BIAS]), math.sin(image[t.BIAS])
+    bias_cosine, bias_sine = image[t.BIAS_COSINE], image[t.BIAS_SINE]
     thick = thickness < T(np.inf)
     zero = T(0)
     for p in range(P):
-        along, towards = tap[t.ALONG * P + p], tap[t.TOWARDS * P + p]
-        reach, far, radius = tap[t.REACH * P + p], frame[t.FAR * P + p], frame[t.RADIUS * P + p]
-        facing, turned, length = frame[t.FACING * P + p], hand * frame[t.TURNED * P + p], frame[t.LENGTH * P + p]
-        noise = frame[t.NOISE * P + p]
+        along, towards = tap[t.ALONG + p], tap[t.TOWARDS + p]
+        reach, far, radius = tap[t.REACH + p], frame[t.FAR + p], frame[t.RADIUS + p]
+        facing, turned, length = frame[t.FACING + p], hand * frame[t.TURNED + p], frame[t.LENGTH + p]
+        noise = frame[t.NOISE + p]
         ray_x, ray_y = a.view_ray(reach, far, ortho)
         span = thickness * radius
         first, last, hit = a.clip(along, towards, ray_x, ray_y, radius, span)
-        hit = hit & (tap[t.SEEN * P + p] > zero)
+        hit = hit & (tap[t.SEEN + p] > zero)
         low, high = ends[p], ends[P + p]
         # Ends below the floor pull at it alike; what is not hit is as if it lay there.
         ha, ht, hf, hn, hv, hb = amount_at(
@@ -172,16 +172,16 @@ def tap_arc(
         to_reach, to_far = view_ray(
             cx + first * ha + last * la, cy + first * ht + last * lt, ray_x, ray_y, reach, far, ortho
         )
-        tap[t.TO_ALONG * P + p] += ha + la + ca if hit else zero
-        tap[t.TO_TOWARDS * P + p] += ht + lt + ct if hit else zero
-        tap[t.TO_REACH * P + p] += to_reach if hit else zero
-        pixel[FAR * P + p] += to_far if hit else zero
-        pixel[RADIUS * P + p] += cr + (cl * thickness if thick else zero) if hit else zero
-        pixel[THICKNESS * P + p] += cl * radius if hit else zero
-        side[TO_FACING * P + p] += hf + lf if hit else zero
-        side[TO_TURNED * P + p] += hn + ln if hit else zero
-        side[TO_VIEW * P + p] += hv + lv if hit else zero
-        side[TO_FLOOR * P + p] += hb + lb if hit else high + low
+        tap[t.TO_ALONG + p] += ha + la + ca if hit else zero
+        tap[t.TO_TOWARDS + p] += ht + lt + ct if hit else zero
+        tap[t.TO_REACH + p] += to_reach if hit else zero
+        pixel[FAR + p] += to_far if hit else zero
+        pixel[RADIUS + p] += cr + (cl * thickness if thick else zero) if hit else zero
+        pixel[THICKNESS + p] += cl * radius if hit else zero
+        side[TO_FACING + p] += hf + lf if hit else zero
+        side[TO_TURNED + p] += hn + ln if hit else zero
+        side[TO_VIEW + p] += hv + lv if hit else zero
+        side[TO_FLOOR + p] += hb + lb if hit else high + low
 
 
 @njit(**OPTIONS)
@@ -191,17 +191,17 @@ def link_arc(
 ) -> None:  # fmt: skip
     T = pixel.dtype.type
     hand, step, slope = T(sign), min(image[t.THICKNESS], T(LINK_STEP)), T(CONNECTED_SLOPE)
-    bias_cosine, bias_sine = math.cos(image[t.BIAS]), math.sin(image[t.BIAS])
+    bias_cosine, bias_sine = image[t.BIAS_COSINE], image[t.BIAS_SINE]
     one, zero = T(1), T(0)
     for p in range(P):
-        along, towards = tap[t.ALONG * P + p], tap[t.TOWARDS * P + p]
-        from_along = zero if start else before[t.ALONG * P + p]
-        from_towards = zero if start else before[t.TOWARDS * P + p]
-        seen_before = one if start else before[t.SEEN * P + p]
-        facing, turned, length = frame[t.FACING * P + p], hand * frame[t.TURNED * P + p], frame[t.LENGTH * P + p]
-        noise, radius = frame[t.NOISE * P + p], frame[t.RADIUS * P + p]
+        along, towards = tap[t.ALONG + p], tap[t.TOWARDS + p]
+        from_along = zero if start else before[t.ALONG + p]
+        from_towards = zero if start else before[t.TOWARDS + p]
+        seen_before = one if start else before[t.SEEN + p]
+        facing, turned, length = frame[t.FACING + p], hand * frame[t.TURNED + p], frame[t.LENGTH + p]
+        noise, radius = frame[t.NOISE + p], frame[t.RADIUS + p]
         across, rise = along - from_along, towards - from_towards
-        same = a.joined(across, rise, tap[t.SEEN * P + p], seen_before, slope, step * radius, True)
+        same = a.joined(across, rise, tap[t.SEEN + p], seen_before, slope, step * radius, True)
         span = math.sqrt(across * across + rise * rise)
         across, rise = across / span, rise / span
         first, last, hit = a.clip(from_along, from_towards, across, rise, radius, span)
@@ -226,16 +226,16 @@ def link_arc(
         to_x, to_y = cx + first * na + last * fa, cy + first * nt + last * ft
         radial = across * to_x + rise * to_y
         to_x, to_y = (to_x - across * radial) / span + cl * across, (to_y - rise * radial) / span + cl * rise
-        tap[t.TO_ALONG * P + p] += to_x if hit else zero
-        tap[t.TO_TOWARDS * P + p] += to_y if hit else zero
+        tap[t.TO_ALONG + p] += to_x if hit else zero
+        tap[t.TO_TOWARDS + p] += to_y if hit else zero
         if not start:
-            before[t.TO_ALONG * P + p] += na + fa + ca - to_x if hit else zero
-            before[t.TO_TOWARDS * P + p] += nt + ft + ct - to_y if hit else zero
-        pixel[RADIUS * P + p] += cr if hit else zero
-        side[TO_FACING * P + p] += nf + ff if hit else zero
-        side[TO_TURNED * P + p] += nn + fn if hit else zero
-        side[TO_VIEW * P + p] += nv + fv if hit else zero
-        side[TO_FLOOR * P + p] += nb + fb if hit else to_near + to_far
+            before[t.TO_ALONG + p] += na + fa + ca - to_x if hit else zero
+            before[t.TO_TOWARDS + p] += nt + ft + ct - to_y if hit else zero
+        pixel[RADIUS + p] += cr if hit else zero
+        side[TO_FACING + p] += nf + ff if hit else zero
+        side[TO_TURNED + p] += nn + fn if hit else zero
+        side[TO_VIEW + p] += nv + fv if hit else zero
+        side[TO_FLOOR + p] += nb + fb if hit else to_near + to_far
 
 
 @njit(**OPTIONS)
@@ -249,33 +249,33 @@ def raise_horizon(
     """
     T = pixel.dtype.type
     hand, thickness = T(sign), image[t.THICKNESS]
-    bias_cosine, bias_sine = math.cos(image[t.BIAS]), math.sin(image[t.BIAS])
+    bias_cosine, bias_sine = image[t.BIAS_COSINE], image[t.BIAS_SINE]
     slope, step, one, zero, half = T(TRAPEZOID_SLOPE), T(TRAPEZOID_STEP), T(1), T(0), T(0.5)
     thick = thickness < T(np.inf)
     for p in range(P):
-        along, towards = tap[t.ALONG * P + p], tap[t.TOWARDS * P + p]
-        reach, far, radius = tap[t.REACH * P + p], frame[t.FAR * P + p], frame[t.RADIUS * P + p]
-        facing, turned, length = frame[t.FACING * P + p], hand * frame[t.TURNED * P + p], frame[t.LENGTH * P + p]
-        noise, cot, carry = frame[t.NOISE * P + p], pixel[COT * P + p], side[CARRY * P + p]
-        across = along - (zero if start else before[t.ALONG * P + p])
-        rise = towards - (zero if start else before[t.TOWARDS * P + p])
-        seen, seen_before = tap[t.SEEN * P + p], one if start else before[t.SEEN * P + p]
+        along, towards = tap[t.ALONG + p], tap[t.TOWARDS + p]
+        reach, far, radius = tap[t.REACH + p], frame[t.FAR + p], frame[t.RADIUS + p]
+        facing, turned, length = frame[t.FACING + p], hand * frame[t.TURNED + p], frame[t.LENGTH + p]
+        noise, cot, carry = frame[t.NOISE + p], pixel[COT + p], side[CARRY + p]
+        across = along - (zero if start else before[t.ALONG + p])
+        rise = towards - (zero if start else before[t.TOWARDS + p])
+        seen, seen_before = tap[t.SEEN + p], one if start else before[t.SEEN + p]
         same = a.joined(across, rise, seen, seen_before, slope, step * radius, False)
-        weight = arc[a.PLACE * P + p]
-        earlier = one if start else arc_before[a.PLACE * P + p]
-        low, high = arc[a.LOW * P + p], arc[a.HIGH * P + p]
-        reached = arc[a.BEFORE * P + p]
+        weight = arc[a.PLACE + p]
+        earlier = one if start else arc_before[a.PLACE + p]
+        low, high = arc[a.LOW + p], arc[a.HIGH + p]
+        reached = arc[a.BEFORE + p]
         mean = half * ((earlier if same else weight) + weight) * cot
         raised, from_back = high > reached, low > reached
         counts = raised & (low < high)
         to_front = (mean if counts else zero) + carry if raised else zero
         to_back = -mean if counts & from_back else zero
         keep = zero if from_back else (-mean if counts else zero)
-        side[CARRY * P + p] = keep if raised else carry
+        side[CARRY + p] = keep if raised else carry
         to_weight = half * cot * (high - low)
-        arc[a.TO_HIGH * P + p] += to_weight if same else to_weight + to_weight
+        arc[a.TO_HIGH + p] += to_weight if same else to_weight + to_weight
         if not start:
-            arc_before[a.TO_HIGH * P + p] += to_weight if same else zero
+            arc_before[a.TO_HIGH + p] += to_weight if same else zero
         fa, ft, ff, fn, fv, _ = amount_at(
             to_front, along, towards, facing, turned, length, noise, bias_cosine, bias_sine, by_cosine
         )
@@ -289,15 +289,15 @@ def raise_horizon(
         to_reach, to_far = view_ray(depth * ba, depth * bt, ray_x, ray_y, reach, far, ortho)
         pulled = to_back != zero
         ba, bt, bf, bn, bv = (ba, bt, bf, bn, bv) if pulled else (zero, zero, zero, zero, zero)
-        tap[t.TO_ALONG * P + p] += (fa if raised else zero) + ba
-        tap[t.TO_TOWARDS * P + p] += (ft if raised else zero) + bt
-        tap[t.TO_REACH * P + p] += to_reach if pulled else zero
-        pixel[FAR * P + p] += to_far if pulled else zero
-        pixel[RADIUS * P + p] += to_depth * thickness if pulled else zero
-        pixel[THICKNESS * P + p] += to_depth * radius if pulled else zero
-        side[TO_FACING * P + p] += (ff if raised else zero) + bf
-        side[TO_TURNED * P + p] += (fn if raised else zero) + bn
-        side[TO_VIEW * P + p] += (fv if raised else zero) + bv
+        tap[t.TO_ALONG + p] += (fa if raised else zero) + ba
+        tap[t.TO_TOWARDS + p] += (ft if raised else zero) + bt
+        tap[t.TO_REACH + p] += to_reach if pulled else zero
+        pixel[FAR + p] += to_far if pulled else zero
+        pixel[RADIUS + p] += to_depth * thickness if pulled else zero
+        pixel[THICKNESS + p] += to_depth * radius if pulled else zero
+        side[TO_FACING + p] += (ff if raised else zero) + bf
+        side[TO_TURNED + p] += (fn if raised else zero) + bn
+        side[TO_VIEW + p] += (fv if raised else zero) + bv
 
 
 @njit(**OPTIONS)
@@ -307,18 +307,18 @@ def weigh_tap(frame: Any, tap: Any, arc: Any, pixel: Any, image: Any) -> None:
     least = T(DISTANCE_FLOOR) if falloff < one else zero
     tiny = T(np.finfo(T).tiny)
     for p in range(P):
-        grad, radius = arc[a.TO_HIGH * P + p], frame[t.RADIUS * P + p]
-        along, towards = tap[t.ALONG * P + p], tap[t.TOWARDS * P + p]
+        grad, radius = arc[a.TO_HIGH + p], frame[t.RADIUS + p]
+        along, towards = tap[t.ALONG + p], tap[t.TOWARDS + p]
         length = math.sqrt(along * along + towards * towards)
         distance = length / radius
-        near = (distance < one) & (tap[t.SEEN * P + p] > zero)
+        near = (distance < one) & (tap[t.SEEN + p] > zero)
         to_distance = -falloff * power(max(distance, least), falloff - one) * grad
         to_falloff = -power(distance, falloff) * logarithm(max(distance, tiny)) * grad
         to_length = to_distance / radius
-        tap[t.TO_ALONG * P + p] += to_length * along / length if near else zero
-        tap[t.TO_TOWARDS * P + p] += to_length * towards / length if near else zero
-        pixel[RADIUS * P + p] -= to_length * distance if near else zero
-        pixel[FALLOFF * P + p] += to_falloff if near else zero
+        tap[t.TO_ALONG + p] += to_length * along / length if near else zero
+        tap[t.TO_TOWARDS + p] += to_length * towards / length if near else zero
+        pixel[RADIUS + p] -= to_length * distance if near else zero
+        pixel[FALLOFF + p] += to_falloff if near else zero
 
 
 @njit(**OPTIONS)
@@ -326,18 +326,16 @@ def set_side(frame: Any, side: Any, pixel: Any, image: Any, sign: float, by_cosi
     """Hand on what the side has gathered: the floor to the bias and the normal, the view angle to the normal."""
     T = pixel.dtype.type
     bias, hand, half, zero = image[t.BIAS], T(sign), T(0.5), T(0)
-    sine, cosine = math.sin(bias), math.cos(bias)
+    sine, cosine = image[t.BIAS_SINE], image[t.BIAS_COSINE]
     to_facing, to_turned = half * sine * sine, half * (bias - cosine * sine)
     for p in range(P):
-        facing, turned, length = frame[t.FACING * P + p], hand * frame[t.TURNED * P + p], frame[t.LENGTH * P + p]
-        floor = side[TO_FLOOR * P + p]
+        facing, turned, length = frame[t.FACING + p], hand * frame[t.TURNED + p], frame[t.LENGTH + p]
+        floor = side[TO_FLOOR + p]
         into = (cosine * facing + sine * turned) * (sine if by_cosine else half / length)
-        view = side[TO_VIEW * P + p] + (zero if by_cosine else floor * (into - half * facing / length))
+        view = side[TO_VIEW + p] + (zero if by_cosine else floor * (into - half * facing / length))
         square = length * length
-        pixel[BIAS * P + p] += floor * into
-        pixel[FACING * P + p] += (
-            side[TO_FACING * P + p] + (floor * to_facing if by_cosine else zero) + view * turned / square
-        )
-        pixel[TURNED * P + p] += hand * (
-            side[TO_TURNED * P + p] + (floor * to_turned if by_cosine else zero) - view * facing / square
+        pixel[BIAS + p] += floor * into
+        pixel[FACING + p] += side[TO_FACING + p] + (floor * to_facing if by_cosine else zero) + view * turned / square
+        pixel[TURNED + p] += hand * (
+            side[TO_TURNED + p] + (floor * to_turned if by_cosine else zero) - view * facing / square
         )

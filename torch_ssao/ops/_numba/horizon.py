@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torch_ssao.ops._numba import horizon_rows as rows
-from torch_ssao.ops._numba import taps_back
+from torch_ssao.ops._numba import taps, taps_back
 from torch_ssao.ops._numba.pool import run_blocks
 from torch_ssao.ops.depth_pyramid import build_pyramid
 from torch_ssao.ops.horizon_taps import Layout
@@ -102,11 +102,12 @@ class _Images:
         self.normal = _array(normal)  # type: ignore[arg-type]
         self.noise = _array(kernel.rotation), _array(kernel.offset)
         longest = np.inf if layout.longest_px is None else layout.longest_px
-        numbers = np.empty((batch, 9), self.dtype)
+        numbers = np.empty((batch, taps.IMAGE_NUMBERS), self.dtype)
         numbers[:, :4] = _array(intrinsics)  # type: ignore[arg-type]
         for place, given in enumerate((radius, falloff, thickness, bias)):
-            numbers[:, 4 + place] = np.inf if given is None else _array(given)
-        numbers[:, 8] = longest
+            numbers[:, taps.R + place] = np.inf if given is None else _array(given)
+        numbers[:, taps.LONGEST_PX] = longest
+        numbers[:, taps.BIAS_COSINE], numbers[:, taps.BIAS_SINE] = (f(numbers[:, taps.BIAS]) for f in (np.cos, np.sin))
         self.numbers = numbers
         connected = kernel.connected and kernel.estimator == "bitmask"
         self.network = sorting_network(layout.steps * (2 if connected else 1))

@@ -11,7 +11,7 @@ from torch_ssao.ops._numba import arcs as a
 from torch_ssao.ops._numba import arcs_back as ab
 from torch_ssao.ops._numba import taps as t
 from torch_ssao.ops._numba import taps_back as tb
-from torch_ssao.ops._numba.maths import LANES, OPTIONS
+from torch_ssao.ops._numba.maths import LANES, OPTIONS, entry
 
 P = LANES
 # Whole numbers and flags of a question.
@@ -44,7 +44,7 @@ def find_arcs(frame: Any, taps: Any, arcs: Any, sums: Any, image: Any, network: 
     a.set_side(frame, sums, image, sign, cosine)
     if form[INCREMENTS] != 0:
         for k in range(steps):
-            before = max(k - 1, 0)
+            before = k - 1 if k else steps
             a.weigh_tap(frame, taps[k], arcs[k], image)
             a.raise_horizon(
                 frame, taps[k], taps[before], arcs[k], arcs[before], sums, image, k == 0, sign, ortho, cosine
@@ -53,19 +53,20 @@ def find_arcs(frame: Any, taps: Any, arcs: Any, sums: Any, image: Any, network: 
     for k in range(steps):
         a.tap_arc(frame, taps[k], arcs[k], sums, image, k, sign, ortho, cosine)
         if form[CONNECTED] != 0:
-            place = steps + k
-            a.link_arc(frame, taps[k], taps[max(k - 1, 0)], arcs[place], sums, image, place, k == 0, sign, cosine)
+            before, place = k - 1 if k else steps, steps + k
+            a.link_arc(frame, taps[k], taps[before], arcs[place], sums, image, place, k == 0, sign, cosine)
     a.sort_arcs(arcs, network)
     a.unite(arcs, sums, 2 * steps if form[CONNECTED] != 0 else steps)
 
 
 @njit(**OPTIONS)
 def scratch(like: Any, form: Any) -> tuple[Any, Any, Any, Any, Any]:
-    """Rows that the loops work on."""
+    """Rows that the loops work on. What comes before the first tap is a row of its own: a loop over rows that may be one
+    and the same does not vectorise."""
     steps = form[STEPS]
-    frame, sums = np.zeros(t.FRAME_ROWS * P, like.dtype), np.zeros(a.SUM_ROWS * P, like.dtype)
-    taps = np.zeros((steps, t.TAP_ROWS * P), like.dtype)
-    arcs = np.zeros((2 * steps, a.ARC_ROWS * P), like.dtype)
+    frame, sums = np.zeros(t.FRAME_SIZE, like.dtype), np.zeros(a.SUM_SIZE, like.dtype)
+    taps = np.zeros((steps + 1, t.TAP_SIZE), like.dtype)
+    arcs = np.zeros((2 * steps + 1, a.ARC_SIZE), like.dtype)
     return frame, taps, arcs, sums, np.zeros((steps, P), np.int32)
 
 
@@ -76,7 +77,7 @@ def add_slices(
 ) -> None:  # fmt: skip
     """Obscurance of the pixels in `frame`, times the number of slices, into the row TOTAL."""
     frame, taps, arcs, sums, source = work
-    sums[a.TOTAL * P : (a.TOTAL + 1) * P] = sums.dtype.type(0)
+    sums[a.TOTAL : a.TOTAL + P] = sums.dtype.type(0)
     for number in range(form[SLICES]):
         t.set_slice(frame, image, number, form[SLICES], form[ORTHO] != 0)
         for side in range(2):
@@ -84,7 +85,7 @@ def add_slices(
             find_arcs(frame, taps, arcs, sums, image, network, form, side)
 
 
-@njit(**OPTIONS)
+@entry
 def rows_value(
     out: Any, texels: Any, normal: Any, rotation: Any, offset: Any, image: Any, network: Any, pyramid: Any, form: Any,
     step_power: float, first_row: int, last_row: int,
@@ -106,7 +107,7 @@ def rows_value(
             t.set_pixels(frame, image, texels, normal, rotation, offset, row, first, form[ORTHO] != 0)
             add_slices(work, texels, image, network, pyramid, form, step_power, 1.0, row, height, width)
             for p in range(min(P, width - first)):
-                out[row, first + p] = sums[a.TOTAL * P + p] * share
+                out[row, first + p] = sums[a.TOTAL + p] * share
 
 
 @njit(**OPTIONS)
@@ -118,9 +119,9 @@ def take_back_arcs(
     ab.clear_taps(taps)
     side_sums[:] = side_sums.dtype.type(0)
     if form[INCREMENTS] != 0:
-        arcs[:, a.TO_HIGH * P : (a.TO_HIGH + 1) * P] = arcs.dtype.type(0)
+        arcs[:, a.TO_HIGH : a.TO_HIGH + P] = arcs.dtype.type(0)
         for k in range(steps - 1, -1, -1):
-            before = max(k - 1, 0)
+            before = k - 1 if k else steps
             ab.raise_horizon(
                 frame,
                 taps[k],
@@ -136,7 +137,7 @@ def take_back_arcs(
                 cosine,
             )
             ab.weigh_tap(frame, taps[k], arcs[k], pixel, image)
-        side_sums[ab.TO_FLOOR * P : (ab.TO_FLOOR + 1) * P] = side_sums[ab.CARRY * P : (ab.CARRY + 1) * P]
+        side_sums[ab.TO_FLOOR : ab.TO_FLOOR + P] = side_sums[ab.CARRY : ab.CARRY + P]
     else:
         count = 2 * steps if form[CONNECTED] != 0 else steps
         ab.unite(arcs, pixel, side_sums, count)
@@ -144,7 +145,7 @@ def take_back_arcs(
         for k in range(steps):
             ab.tap_arc(frame, taps[k], ends[k], side_sums, pixel, image, sign, ortho, cosine)
             if form[CONNECTED] != 0:
-                before, place = max(k - 1, 0), steps + k
+                before, place = k - 1 if k else steps, steps + k
                 ab.link_arc(frame, taps[k], taps[before], ends[place], side_sums, pixel, image, k == 0, sign, cosine)
     ab.set_side(frame, side_sums, pixel, image, sign, cosine)
 
@@ -169,7 +170,7 @@ def take_back_slices(
         tb.set_slice(frame, pixel, image, form[ORTHO] != 0)
 
 
-@njit(**OPTIONS)
+@entry
 def rows_pull_back(
     cotangent: Any, to_texels: Any, reached: Any, to_normal: Any, to_image: Any, texels: Any, normal: Any, rotation: Any,
     offset: Any, image: Any, network: Any, pyramid: Any, form: Any, step_power: float, step: float, first_row: int,
@@ -186,7 +187,7 @@ def rows_pull_back(
     T = cotangent.dtype.type
     work = scratch(cotangent, form)
     frame, _, _, sums, _ = work
-    pixel, side_sums = np.zeros(ab.PIXEL_ROWS * P, cotangent.dtype), np.zeros(ab.SIDE_ROWS * P, cotangent.dtype)
+    pixel, side_sums = np.zeros(ab.PIXEL_SIZE, cotangent.dtype), np.zeros(ab.SIDE_SIZE, cotangent.dtype)
     ends, change = np.zeros((2 * form[STEPS], 2 * P), cotangent.dtype), np.zeros(P, cotangent.dtype)
     share, ortho = T(1) / T(form[SLICES]), form[ORTHO] != 0
     reached[0], reached[1] = first_row * width, last_row * width - 1
@@ -195,13 +196,13 @@ def rows_pull_back(
             t.set_pixels(frame, image, texels, normal, rotation, offset, row, first, ortho)
             pixel[:] = T(0)
             for p in range(min(P, width - first)):
-                pixel[ab.COT * P + p] = cotangent[row, first + p] * share
+                pixel[ab.COT + p] = cotangent[row, first + p] * share
             if step > 0:
                 add_slices(work, texels, image, network, pyramid, form, step_power, 1 - step, row, height, width)
-                change[:] = -sums[a.TOTAL * P : (a.TOTAL + 1) * P]
+                change[:] = -sums[a.TOTAL : a.TOTAL + P]
                 add_slices(work, texels, image, network, pyramid, form, step_power, 1 + step, row, height, width)
                 for p in range(P):
-                    change[p] = (change[p] + sums[a.TOTAL * P + p]) / T(2 * step)
+                    change[p] = (change[p] + sums[a.TOTAL + p]) / T(2 * step)
                 tb.spread(frame, pixel, image, to_image, to_texels, change, row, first, width, ortho)
             take_back_slices(
                 work, (pixel, side_sums, ends), to_texels, reached, texels, image, network, pyramid, form,
@@ -210,7 +211,7 @@ def rows_pull_back(
             tb.set_pixels(frame, pixel, image, to_image, to_texels, to_normal, row, first, ortho)
 
 
-@njit(**OPTIONS)
+@entry
 def hand_over(total: Any, part: Any, reached: Any) -> None:
     """Add a block's cotangents of the planes to the image's, and clear them."""
     for i in range(3 * reached[0], 3 * (reached[1] + 1)):

@@ -5,7 +5,11 @@ In float64 they are those of the C library. The float32 forms are Taylor and Che
 
 from __future__ import annotations
 
+import hashlib
 import math
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,10 +17,17 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
 from numba.extending import intrinsic, overload
 
-# How every function here is compiled. A sum of products may be fused; nothing else is reordered, no NaN is ruled out.
-OPTIONS: dict[str, Any] = {"nogil": True, "cache": True, "error_model": "numpy", "fastmath": {"contract"}}
+# How every function here is compiled. A sum of products may be fused; nothing else is reordered, no NaN is ruled out. Only
+# `entry` is called from Python and cached: a cached piece of a function would not notice that it changed.
+OPTIONS: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract"},
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
 STRICT: dict[str, Any] = OPTIONS | {"fastmath": False}  # where taps are rounded to pixels: as the torch op rounds
-LANES = 64  # pixels of a row worked on at a time: a loop over them is the innermost one
+LANES = 128  # pixels of a row worked on at a time: a loop over them is the innermost one
 
 _F = np.float32
 _HALF_PI, _PI, _QUARTER_PI = _F(math.pi / 2), _F(math.pi), _F(math.pi / 4)
@@ -30,6 +41,28 @@ _LOG = tuple(
 _EXP = tuple(_F(math.log(2) ** k / math.factorial(k)) for k in range(8))
 _ROUND32, _ROUND64 = _F(1.5 * 2.0**23), 1.5 * 2.0**52
 _LN2 = _F(math.log(2))
+
+
+def entry(function: Callable[..., None]) -> Callable[..., None]:
+    """Compile on first use a function that Python calls, and keep it on disk.
+
+    The cache looks at the function's own file only, but it holds what other files define: their digest is made part of the name.
+    """
+    function.__qualname__ = f"{function.__qualname__}_{_digest()}"
+    options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+    try:
+        return njit(cache=True, **options)(function)
+    except RuntimeError:  # nowhere to write to
+        return njit(**options)(function)
+
+
+@cache
+def _digest() -> str:
+    found = hashlib.sha256()
+    folder = Path(__file__).parent
+    for path in sorted([*folder.glob("*.py"), *folder.parent.glob("*.py")]):
+        found.update(path.read_bytes())
+    return found.hexdigest()[:16]
 
 
 @intrinsic

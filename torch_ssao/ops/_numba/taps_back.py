@@ -23,13 +23,13 @@ def meet_plane(frame: Any, tap: Any, pixel: Any, ortho: bool) -> None:
     T = pixel.dtype.type
     one, zero = T(1), T(0)
     for p in range(P):
-        seen = tap[t.SEEN * P + p] > zero
-        to_along, to_towards = tap[t.TO_ALONG * P + p], tap[t.TO_TOWARDS * P + p]
-        to_reach = tap[t.TO_REACH * P + p]
-        shrunk, away, reach = tap[t.SHRUNK * P + p], tap[t.AWAY * P + p], tap[t.REACH * P + p]
-        depth, level, far = frame[t.DEPTH * P + p], tap[t.SEEN_LEVEL * P + p], frame[t.FAR * P + p]
-        step_x, step_y = frame[t.STEP_X * P + p], frame[t.STEP_Y * P + p]
-        major, recession = frame[t.MAJOR * P + p], frame[t.RECESSION * P + p]
+        seen = tap[t.SEEN + p] > zero
+        to_along, to_towards = tap[t.TO_ALONG + p], tap[t.TO_TOWARDS + p]
+        to_reach = tap[t.TO_REACH + p]
+        shrunk, away, reach = tap[t.SHRUNK + p], tap[t.AWAY + p], tap[t.REACH + p]
+        depth, level, far = frame[t.DEPTH + p], tap[t.SEEN_LEVEL + p], frame[t.FAR + p]
+        step_x, step_y = frame[t.STEP_X + p], frame[t.STEP_Y + p]
+        major, recession = frame[t.MAJOR + p], frame[t.RECESSION + p]
         scale = one if ortho else one / (level * depth * away)
         to_scale = -(to_along * reach - to_towards * far) * scale
         to_level = -to_towards if ortho else to_scale / level
@@ -39,20 +39,20 @@ def meet_plane(frame: Any, tap: Any, pixel: Any, ortho: bool) -> None:
         to_away = (zero if ortho else to_scale / away) + to_reach * abs(shrunk)
         to_recession = to_away * shrunk * away * away
         to_shrunk = to_reach * away * (one if shrunk > zero else -one) + to_away * recession * away * away
-        to_x, to_y = to_level * tap[t.P1 * P + p], to_level * tap[t.P2 * P + p]
+        to_x, to_y = to_level * tap[t.P1 + p], to_level * tap[t.P2 + p]
         to_shrunk = to_shrunk + to_x * step_x + to_y * step_y
         to_major = -to_shrunk * shrunk / major
         wide = abs(step_x) >= abs(step_y)
         to_x = to_x * shrunk + ((to_major if step_x > zero else -to_major) if wide else zero)
         to_y = to_y * shrunk + (zero if wide else (to_major if step_y > zero else -to_major))
-        tap[t.P0 * P + p] = to_level if seen else zero
-        tap[t.P1 * P + p] = to_level * tap[t.INSIDE_X * P + p] if seen else zero
-        tap[t.P2 * P + p] = to_level * tap[t.INSIDE_Y * P + p] if seen else zero
-        pixel[b.DEPTH * P + p] += to_depth if seen else zero
-        pixel[b.FAR * P + p] += to_far if seen else zero
-        pixel[b.STEP_X * P + p] += to_x if seen else zero
-        pixel[b.STEP_Y * P + p] += to_y if seen else zero
-        pixel[b.RECESSION * P + p] += (zero if ortho else to_recession) if seen else zero
+        tap[t.P0 + p] = to_level if seen else zero
+        tap[t.P1 + p] = to_level * tap[t.INSIDE_X + p] if seen else zero
+        tap[t.P2 + p] = to_level * tap[t.INSIDE_Y + p] if seen else zero
+        pixel[b.DEPTH + p] += to_depth if seen else zero
+        pixel[b.FAR + p] += to_far if seen else zero
+        pixel[b.STEP_X + p] += to_x if seen else zero
+        pixel[b.STEP_Y + p] += to_y if seen else zero
+        pixel[b.RECESSION + p] += (zero if ortho else to_recession) if seen else zero
 
 
 @njit(**OPTIONS)
@@ -62,9 +62,9 @@ def fetch(tap: Any, source: Any, to_texels: Any, reached: Any) -> None:
     for p in range(P):
         first, last = min(first, source[p]), max(last, source[p])
         at = 3 * np.uintp(source[p])
-        to_texels[at] += tap[t.P0 * P + p]
-        to_texels[at + np.uintp(1)] += tap[t.P1 * P + p]
-        to_texels[at + np.uintp(2)] += tap[t.P2 * P + p]
+        to_texels[at] += tap[t.P0 + p]
+        to_texels[at + np.uintp(1)] += tap[t.P1 + p]
+        to_texels[at + np.uintp(2)] += tap[t.P2 + p]
     reached[0], reached[1] = first, last
 
 
@@ -74,36 +74,36 @@ def set_slice(frame: Any, pixel: Any, image: Any, ortho: bool) -> None:
     T = pixel.dtype.type
     fx, fy, one, zero = image[t.FX], image[t.FY], T(1), T(0)
     for p in range(P):
-        cosine, sine = frame[t.COSINE * P + p], frame[t.SINE * P + p]
-        x, y, depth = frame[t.X * P + p], frame[t.Y * P + p], frame[t.DEPTH * P + p]
-        dx, dy, dz = frame[t.DIRECTION_X * P + p], frame[t.DIRECTION_Y * P + p], frame[t.DIRECTION_Z * P + p]
-        to_turned, to_recession = pixel[b.TURNED * P + p], pixel[b.RECESSION * P + p]
-        to_x, to_y = pixel[b.STEP_X * P + p], pixel[b.STEP_Y * P + p]
-        pixel[b.NX * P + p] += to_turned * dx
-        pixel[b.NY * P + p] += to_turned * dy
-        pixel[b.NZ * P + p] += to_turned * dz
-        pixel[b.FX * P + p] += to_x * frame[t.STEP_X * P + p] / fx
-        pixel[b.FY * P + p] += to_y * frame[t.STEP_Y * P + p] / fy
+        cosine, sine = frame[t.COSINE + p], frame[t.SINE + p]
+        x, y, depth = frame[t.X + p], frame[t.Y + p], frame[t.DEPTH + p]
+        dx, dy, dz = frame[t.DIRECTION_X + p], frame[t.DIRECTION_Y + p], frame[t.DIRECTION_Z + p]
+        to_turned, to_recession = pixel[b.TURNED + p], pixel[b.RECESSION + p]
+        to_x, to_y = pixel[b.STEP_X + p], pixel[b.STEP_Y + p]
+        pixel[b.NX + p] += to_turned * dx
+        pixel[b.NY + p] += to_turned * dy
+        pixel[b.NZ + p] += to_turned * dz
+        pixel[b.FX + p] += to_x * frame[t.STEP_X + p] / fx
+        pixel[b.FY + p] += to_y * frame[t.STEP_Y + p] / fy
         along_x, along_y = to_x * fx / depth, to_y * fy / depth
-        to_depth = to_x * frame[t.STEP_X * P + p] + to_y * frame[t.STEP_Y * P + p]
-        to_depth = -(to_depth + to_recession * frame[t.RECESSION * P + p]) / depth
-        to_dx = along_x + to_turned * frame[t.NX * P + p]
-        to_dy = along_y + to_turned * frame[t.NY * P + p]
-        to_dz = to_recession / depth - along_x * x - along_y * y + to_turned * frame[t.NZ * P + p]
+        to_depth = to_x * frame[t.STEP_X + p] + to_y * frame[t.STEP_Y + p]
+        to_depth = -(to_depth + to_recession * frame[t.RECESSION + p]) / depth
+        to_dx = along_x + to_turned * frame[t.NX + p]
+        to_dy = along_y + to_turned * frame[t.NY + p]
+        to_dz = to_recession / depth - along_x * x - along_y * y + to_turned * frame[t.NZ + p]
         # The direction is (cosine - a u w, sine - b u w, -u) with u = a cosine + b sine and w = 1 / (1 + c).
         stretch = math.sqrt(one + x * x + y * y)
         a, b_, c = x / stretch, y / stretch, one / stretch
         w = one / (one + c)
         to_u = -(to_dx * a + to_dy * b_) * w - to_dz
-        pixel[b.A * P + p] += zero if ortho else to_u * cosine + to_dx * w * dz
-        pixel[b.B * P + p] += zero if ortho else to_u * sine + to_dy * w * dz
-        pixel[b.C * P + p] -= zero if ortho else dz * (to_dx * a + to_dy * b_) * w * w
+        pixel[b.A + p] += zero if ortho else to_u * cosine + to_dx * w * dz
+        pixel[b.B + p] += zero if ortho else to_u * sine + to_dy * w * dz
+        pixel[b.C + p] -= zero if ortho else dz * (to_dx * a + to_dy * b_) * w * w
         # x and y of the pixel move the slice's steps as well.
-        pixel[b.TO_X * P + p] -= zero if ortho else along_x * dz
-        pixel[b.TO_Y * P + p] -= zero if ortho else along_y * dz
-        pixel[b.DEPTH * P + p] += zero if ortho else to_depth
-        pixel[b.TURNED * P + p] = pixel[b.RECESSION * P + p] = zero
-        pixel[b.STEP_X * P + p] = pixel[b.STEP_Y * P + p] = zero
+        pixel[b.TO_X + p] -= zero if ortho else along_x * dz
+        pixel[b.TO_Y + p] -= zero if ortho else along_y * dz
+        pixel[b.DEPTH + p] += zero if ortho else to_depth
+        pixel[b.TURNED + p] = pixel[b.RECESSION + p] = zero
+        pixel[b.STEP_X + p] = pixel[b.STEP_Y + p] = zero
 
 
 @njit(**OPTIONS)
@@ -118,30 +118,30 @@ def set_pixels(
     share_x = half if fx == fy else (one if fx > fy else zero)
     longest_px = image[t.LONGEST_PX]
     for p in range(min(P, width - first)):
-        x, y, depth = frame[t.X * P + p], frame[t.Y * P + p], frame[t.DEPTH * P + p]
+        x, y, depth = frame[t.X + p], frame[t.Y + p], frame[t.DEPTH + p]
         stretch = one if ortho else math.sqrt(one + x * x + y * y)
         a, b_, c = x / stretch, y / stretch, one / stretch
-        to_facing, to_far = pixel[b.FACING * P + p], pixel[b.FAR * P + p]
-        nx, ny, nz = frame[t.NX * P + p], frame[t.NY * P + p], frame[t.NZ * P + p]
-        to_depth, to_radius = pixel[b.DEPTH * P + p], pixel[b.RADIUS * P + p]
-        to_fx, to_fy = pixel[b.FX * P + p], pixel[b.FY * P + p]
-        if frame[t.FREE * P + p] == zero:  # the cap sets the radius
+        to_facing, to_far = pixel[b.FACING + p], pixel[b.FAR + p]
+        nx, ny, nz = frame[t.NX + p], frame[t.NY + p], frame[t.NZ + p]
+        to_depth, to_radius = pixel[b.DEPTH + p], pixel[b.RADIUS + p]
+        to_fx, to_fy = pixel[b.FX + p], pixel[b.FY + p]
+        if frame[t.FREE + p] == zero:  # the cap sets the radius
             to_limit = to_radius * longest_px / unit
             to_unit = -to_limit * (one if ortho else depth) / unit
             to_depth += zero if ortho else to_limit
             to_fx, to_fy, to_radius = to_fx + to_unit * share_x, to_fy + to_unit * (one - share_x), zero
         if ortho:
-            to_normal[0, row, first + p], to_normal[1, row, first + p] = pixel[b.NX * P + p], pixel[b.NY * P + p]
-            to_normal[2, row, first + p] = pixel[b.NZ * P + p] - to_facing
+            to_normal[0, row, first + p], to_normal[1, row, first + p] = pixel[b.NX + p], pixel[b.NY + p]
+            to_normal[2, row, first + p] = pixel[b.NZ + p] - to_facing
             to_level = to_depth
         else:
-            to_normal[0, row, first + p] = pixel[b.NX * P + p] - to_facing * a
-            to_normal[1, row, first + p] = pixel[b.NY * P + p] - to_facing * b_
-            to_normal[2, row, first + p] = pixel[b.NZ * P + p] - to_facing * c
-            to_a, to_b = pixel[b.A * P + p] - to_facing * nx, pixel[b.B * P + p] - to_facing * ny
-            radial = a * to_a + b_ * to_b + c * (pixel[b.C * P + p] - to_facing * nz)
-            to_x = (to_a - a * radial) / stretch + to_far * depth * a + pixel[b.TO_X * P + p]
-            to_y = (to_b - b_ * radial) / stretch + to_far * depth * b_ + pixel[b.TO_Y * P + p]
+            to_normal[0, row, first + p] = pixel[b.NX + p] - to_facing * a
+            to_normal[1, row, first + p] = pixel[b.NY + p] - to_facing * b_
+            to_normal[2, row, first + p] = pixel[b.NZ + p] - to_facing * c
+            to_a, to_b = pixel[b.A + p] - to_facing * nx, pixel[b.B + p] - to_facing * ny
+            radial = a * to_a + b_ * to_b + c * (pixel[b.C + p] - to_facing * nz)
+            to_x = (to_a - a * radial) / stretch + to_far * depth * a + pixel[b.TO_X + p]
+            to_y = (to_b - b_ * radial) / stretch + to_far * depth * b_ + pixel[b.TO_Y + p]
             to_depth += to_far * stretch
             to_level = -to_depth * depth * depth
             to_fx, to_fy = to_fx - to_x * x / fx, to_fy - to_y * y / fy
@@ -151,9 +151,9 @@ def set_pixels(
         to_image[FX] += to_fx
         to_image[FY] += to_fy
         to_image[R] += to_radius
-        to_image[FALLOFF] += pixel[b.FALLOFF * P + p]
-        to_image[THICKNESS] += pixel[b.THICKNESS * P + p]
-        to_image[BIAS] += pixel[b.BIAS * P + p]
+        to_image[FALLOFF] += pixel[b.FALLOFF + p]
+        to_image[THICKNESS] += pixel[b.THICKNESS + p]
+        to_image[BIAS] += pixel[b.BIAS + p]
 
 
 @njit(**OPTIONS)
@@ -164,9 +164,9 @@ def spread(
     """Of the size of the footprint R f / z in the image; of a change by fx and fy each takes half."""
     T = pixel.dtype.type
     for p in range(min(P, width - first)):
-        grad = pixel[b.COT * P + p] * by_spread[p] * frame[t.FREE * P + p]
+        grad = pixel[b.COT + p] * by_spread[p] * frame[t.FREE + p]
         if not ortho:
-            to_texels[3 * (row * width + first + p)] += grad / frame[t.LEVEL * P + p]
+            to_texels[3 * (row * width + first + p)] += grad / frame[t.LEVEL + p]
         to_image[FX] += T(0.5) * grad / image[t.FX]
         to_image[FY] += T(0.5) * grad / image[t.FY]
         to_image[R] += grad / image[t.R]
