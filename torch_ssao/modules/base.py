@@ -80,6 +80,7 @@ class AmbientVisibility(nn.Module, abc.ABC):
 
     PARAMETERS: ClassVar[dict[str, ParameterSpec]]
     CHOICES: ClassVar[tuple[str, ...]]  # discrete configuration, plain attributes
+    BACKENDS: ClassVar[tuple[str, ...]] = ("auto", "torch")  # those that `forward` takes
 
     radius = Positive()
     contrast = Positive()
@@ -155,11 +156,12 @@ class AmbientVisibility(nn.Module, abc.ABC):
             gbuffer: see `GBuffer`; float16 and bfloat16 depth is computed in float32. Normals are made unit; zero ones, and
                 those that are not finite, face the eye plane. Works without the batch dimension under `torch.func.vmap`.
             frame: integer offset of the noise pattern, for techniques that have one.
-            backend: "auto" or "torch".
+            backend: "torch"; "numba", compiled loops on the CPU (extra `cpu`), for techniques that have them; or "auto", the
+                faster of what there is. It changes speed, never the number.
         Returns: (B, 1, H, W) visibility in [0, 1]; 1 and gradient 0 at invalid pixels.
         Gradients: to depth, normal (through its length too: none along itself), camera and the module's parameters.
         """
-        checks.check_choice("backend", backend, ("auto", "torch"))
+        checks.check_choice("backend", backend, self.BACKENDS)
         if gbuffer.depth.ndim == 3:  # inside vmap
             batched = pytree.tree_map(lambda leaf: leaf.unsqueeze(0), gbuffer)
             return self.forward(batched, frame=frame, backend=backend).squeeze(0)

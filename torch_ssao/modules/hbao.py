@@ -13,6 +13,7 @@ from torch_ssao import checks
 from torch_ssao.camera import Camera
 from torch_ssao.gbuffer import GBuffer
 from torch_ssao.modules.base import AmbientVisibility, ParameterSpec, Positive
+from torch_ssao.ops.backend import BACKENDS
 from torch_ssao.ops.horizon import ESTIMATORS, OFFSCREEN, WEIGHTINGS, horizon_obscurance
 from torch_ssao.ops.horizon_bent import horizon_bent_normal
 from torch_ssao.ops.normals import normals_from_points
@@ -72,6 +73,8 @@ class HBAO(AmbientVisibility):
         "denoise",
         "half_resolution",
     )
+
+    BACKENDS = BACKENDS
 
     falloff = Positive()
     thickness = Positive()
@@ -145,7 +148,7 @@ class HBAO(AmbientVisibility):
         self, depth: Tensor, valid: Tensor, normal: Tensor | None, camera: Camera, *, frame: int, backend: str
     ) -> Tensor:
         tensors, options = self._question(depth, valid, normal, camera, frame)
-        return 1 - horizon_obscurance(*tensors, **options)
+        return 1 - horizon_obscurance(*tensors, **options, backend=backend)
 
     def bent_normal(self, gbuffer: GBuffer, *, frame: int = 0) -> tuple[Tensor, Tensor]:
         """Visibility and the mean open direction of every pixel, from the same taps.

@@ -26,10 +26,11 @@ from torch import Tensor
 from torch_ssao import checks
 from torch_ssao.ops import horizon_arcs as arcs
 from torch_ssao.ops import horizon_taps as taps
+from torch_ssao.ops.backend import uses_numba
 from torch_ssao.ops.depth_pyramid import Pyramid, build_pyramid
 from torch_ssao.ops.footprint import footprint_fade
 from torch_ssao.ops.horizon_moments import occluded_moments
-from torch_ssao.ops.recompute import Outputs, pull_back, push_forward, recompute
+from torch_ssao.ops.recompute import Kernel, Outputs, pull_back, push_forward, recompute
 
 BLOCK = {"cpu": 2**18, "cuda": 2**21}  # taps worked on at a time: what fits a cache, what fills a GPU
 ESTIMATORS = ("increments", "bitmask")
@@ -61,6 +62,7 @@ def horizon_obscurance(
     max_radius_px: float | None = None,
     offscreen: str = "open",
     footprint_step: float = FOOTPRINT_STEP,
+    backend: str = "torch",
 ) -> Tensor:
     """Obscurance of every pixel from slices of directions through it; the module says how.
 
@@ -82,6 +84,7 @@ def horizon_obscurance(
             stay near each other, what lies between the pixels may be missed. R spans at most 32 times as many. None: no cap.
         offscreen: taps off the image never occlude ("open"), or meet the plane of the nearest pixel ("extend").
         footprint_step: of the footprint, over which its effect is differenced in derivatives.
+        backend: "torch", "numba" or "auto"; see `ops.backend`.
     Returns: (B, H, W) obscurance in [0, 1]; it fades out where R spans less than a pixel (`ops.footprint`).
     Gradients: to depth, normal, intrinsics, radius, falloff, thickness and bias, of the expected estimate (above);
         footprint_step = 0 gives the derivative almost everywhere. Of a change of the footprint by fx and fy each takes half.
@@ -93,7 +96,7 @@ def horizon_obscurance(
     """
     form: dict[str, Any] = {"weighting": weighting, "estimator": estimator, "connected": connected}
     layout: dict[str, Any] = {"slices": slices, "steps": steps, "step_power": step_power, "offscreen": offscreen}
-    rest: dict[str, Any] = {"max_radius_px": max_radius_px, "footprint_step": footprint_step}
+    rest: dict[str, Any] = {"max_radius_px": max_radius_px, "footprint_step": footprint_step, "backend": backend}
     tensors: tuple[Any, ...] = (depth, valid, normal, intrinsics, radius, falloff, thickness, bias, rotation, offset)
     options = form | layout | rest
     found, _ = evaluate_horizon(*tensors, orthographic=orthographic, **options)
@@ -113,6 +116,7 @@ def evaluate_horizon(
     offscreen: str = "open",
     footprint_step: float = FOOTPRINT_STEP,
     bent: bool = False,
+    backend: str = "torch",
 ) -> tuple[Tensor, Tensor]:
     """Obscurance and, with `bent`, the mean direction of what is occluded: `horizon_obscurance` says how, and names the tensors.
 
@@ -126,9 +130,19 @@ def evaluate_horizon(
     planes = taps.surface_planes(depth, valid, intrinsics[:, :2], orthographic=orthographic)
     layout = taps.Layout(slices, steps, step_power, orthographic, max_radius_px, offscreen == "extend")
     kernel = _Horizon(layout, weighting == "cosine", estimator, connected, rotation, offset, footprint_step, bent)
-    found = recompute(kernel, planes, valid, normal, intrinsics, radius, falloff, thickness, bias)
+    loops = uses_numba(backend, depth, lacking="bent normals" if bent else None)
+    found = recompute(
+        _compiled(kernel) if loops else kernel, planes, valid, normal, intrinsics, radius, falloff, thickness, bias
+    )
     fade = footprint_fade(depth, valid, radius[:, None, None], intrinsics[:, :2], orthographic=orthographic)
     return found * fade[:, None], normal
+
+
+def _compiled(kernel: _Horizon) -> Kernel:
+    """The loops beside a kernel; numba is imported here, on first use."""
+    from torch_ssao.ops._numba.horizon import HorizonLoops
+
+    return HorizonLoops(kernel, *kernel[:7])
 
 
 def _usable(normal: Tensor, valid: Tensor) -> Tensor:
