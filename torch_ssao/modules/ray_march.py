@@ -10,6 +10,7 @@ from torch import Tensor
 from torch_ssao import checks
 from torch_ssao.camera import Camera
 from torch_ssao.modules.base import AmbientVisibility, ParameterSpec, Positive
+from torch_ssao.ops.backend import BACKENDS
 from torch_ssao.ops.depth_pyramid import furthest_read
 from torch_ssao.ops.normals import normals_from_points
 from torch_ssao.ops.ray_march import GRADIENTS, ray_march_visibility
@@ -53,6 +54,8 @@ class RayMarchedSSAO(AmbientVisibility):
         "contrast": ParameterSpec("1", 1e-2, 1e2, "exponent of the visibility"),
     }
     CHOICES = ("rays", "steps", "gradient", "surrogate_width", "max_radius_px", "denoise", "half_resolution")
+
+    BACKENDS = BACKENDS
 
     falloff = Positive()
     thickness = Positive()
@@ -125,6 +128,7 @@ class RayMarchedSSAO(AmbientVisibility):
             gradient=self.gradient,
             surrogate_width=self.surrogate_width,
             max_radius_px=self.max_radius_px,
+            backend=backend,
         )
 
     def _reach(self, radius: Tensor, depth: Tensor, camera: Camera) -> Tensor:

@@ -28,11 +28,12 @@ from torch import Tensor
 
 from torch_ssao import checks
 from torch_ssao.ops import ray_march_hit as hit
+from torch_ssao.ops.backend import uses_numba
 from torch_ssao.ops.depth_pyramid import Pyramid, build_pyramid, pixels_of, texels_at
 from torch_ssao.ops.footprint import footprint_fade
 from torch_ssao.ops.plane_support import least_facing
 from torch_ssao.ops.ray_march_hit import Pixels, Steps
-from torch_ssao.ops.recompute import Outputs, pull_back, push_forward, recompute
+from torch_ssao.ops.recompute import Kernel, Outputs, pull_back, push_forward, recompute
 
 GRADIENTS = ("exact", "surrogate", "soft")
 REACH_STEP = 0.05  # relative change of the reach over which its effect is differenced
@@ -57,6 +58,7 @@ def ray_march_visibility(
     surrogate_width: float = 0.05,
     max_radius_px: float | None = None,
     reach_step: float = REACH_STEP,
+    backend: str = "torch",
 ) -> Tensor:
     """Visibility of every pixel from rays marched through the depth layers; the module says how.
 
@@ -75,6 +77,7 @@ def ray_march_visibility(
         max_radius_px: steps further than this many pixels away read a pyramid of selected pixels (`ops.depth_pyramid`); the
             caller shortens the reach to `furthest_read`. None: no cap.
         reach_step: of the reach, over which its effect is differenced in derivatives; 0 for the derivative almost everywhere.
+        backend: "torch", "numba" (gradient "exact" only) or "auto"; see `ops.backend`.
     Returns: (B, H, W) in [0, 1]; 1 at invalid pixels, and it fades to 1 where the reach spans less than a pixel.
     Gradients: to points, normal, reach, falloff and (not "exact") thickness; to intrinsics through the fading alone, and
         to the camera through points. Forward mode alike. Second derivatives raise a RuntimeError.
@@ -89,8 +92,10 @@ def ray_march_visibility(
     height, width = valid.shape[2:]
     spec = _Spec(steps, height, width, orthographic, gradient, surrogate_width, max_radius_px)
     planes = tangent_planes(points, normal, valid, intrinsics, orthographic=orthographic).flatten(2, 3)
+    kernel = _March(spec, disk, rotation.reshape(-1), offset.reshape(-1), reach_step)
+    lacking = None if gradient == "exact" else f"gradient {gradient!r} of the ray march"
     visibility = recompute(
-        _March(spec, disk, rotation.reshape(-1), offset.reshape(-1), reach_step),
+        _compiled(kernel) if uses_numba(backend, points, lacking=lacking) else kernel,
         points[:, :, 0].flatten(2),
         normal[:, :, 0].flatten(2),
         reach.flatten(1),
@@ -102,6 +107,13 @@ def ray_march_visibility(
     )
     fade = footprint_fade(points[:, 2, 0], valid[:, 0], reach, intrinsics[:, :2], orthographic=orthographic)
     return torch.lerp(torch.ones_like(fade), visibility.unflatten(1, (height, width)), fade)
+
+
+def _compiled(kernel: _March) -> Kernel:
+    """The loops beside a kernel; numba is imported here, on first use."""
+    from torch_ssao.ops._numba.ray_march import MarchLoops
+
+    return MarchLoops(kernel, *kernel[:5])
 
 
 def tangent_planes(points: Tensor, normal: Tensor, valid: Tensor, intrinsics: Tensor, *, orthographic: bool) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -13,12 +12,10 @@ from torch import Tensor
 
 from torch_ssao.ops._numba import horizon_rows as rows
 from torch_ssao.ops._numba import taps, taps_back
-from torch_ssao.ops._numba.pool import run_blocks
+from torch_ssao.ops._numba.pool import Spare, row_blocks, run_blocks
 from torch_ssao.ops.depth_pyramid import build_pyramid
 from torch_ssao.ops.horizon_taps import Layout
 from torch_ssao.ops.recompute import Kernel, Outputs
-
-BLOCKS = 16  # of an image's rows, for any number of threads: the order in which derivatives are added up
 
 
 class HorizonLoops(NamedTuple):
@@ -39,10 +36,10 @@ class HorizonLoops(NamedTuple):
         out = np.empty(images.shape, images.dtype)
 
         def work(number: int) -> None:
-            image, first, last = images.block(number)
+            image, first, last = images.blocks[number]
             rows.rows_value(out[image], *images.question(image), first, last)
 
-        run_blocks(images.blocks, work, lambda _: None)
+        run_blocks(len(images.blocks), work, lambda _: None)
         return (torch.from_numpy(out)[:, None],)
 
     def pull_back(
@@ -54,10 +51,10 @@ class HorizonLoops(NamedTuple):
         to_texels = np.zeros((batch, 3 * height * width), images.dtype)
         to_normal = np.empty((batch, 3, height, width), images.dtype)
         to_numbers = np.zeros((batch, 8))
-        spare = _Spare((3 * height * width,), images.dtype)
+        spare = Spare((3 * height * width,), images.dtype)
 
         def work(number: int) -> tuple[int, Any, Any, Any]:
-            image, first, last = images.block(number)
+            image, first, last = images.blocks[number]
             part, numbers, reached = spare.take(), np.zeros(8), np.zeros(2, np.int32)
             rows.rows_pull_back(
                 cotangent[image], part, reached, to_normal[image], numbers, *images.question(image),
@@ -71,7 +68,7 @@ class HorizonLoops(NamedTuple):
             to_numbers[image] += numbers
             spare.give_back(part)
 
-        run_blocks(images.blocks, work, hand_over)
+        run_blocks(len(images.blocks), work, hand_over)
         planes = torch.from_numpy(to_texels).view(batch, height, width, 3).permute(0, 3, 1, 2)
         return self._found(planes, torch.from_numpy(to_normal), torch.from_numpy(to_numbers), needed, tensors)
 
@@ -120,14 +117,7 @@ class _Images:
         if layout.max_radius_px is not None:
             pyramid = build_pyramid(valid, layout.max_radius_px)  # type: ignore[arg-type]
             self.pyramid = _array(pyramid.pixel), _array(pyramid.start), float(pyramid.cap)
-        self.rows = -(-height // BLOCKS)
-        self.per_image = -(-height // self.rows)
-        self.blocks = batch * self.per_image
-
-    def block(self, number: int) -> tuple[int, int, int]:
-        """Image and rows of a block."""
-        image, part = divmod(number, self.per_image)
-        return image, part * self.rows, min((part + 1) * self.rows, self.shape[1])
+        self.blocks = row_blocks(batch, height)
 
     def question(self, image: int) -> tuple[Any, ...]:
         """What the loops take of an image, in their order."""
@@ -137,22 +127,6 @@ class _Images:
             self.texels[image], self.normal[image], *self.noise, self.numbers[image], self.network, self.pyramid, form,
             float(self.kernel.layout.step_power),
         )  # fmt: skip
-
-
-class _Spare:
-    """Arrays of zeros, used again."""
-
-    def __init__(self, shape: tuple[int, ...], dtype: Any) -> None:
-        self.shape, self.dtype = shape, dtype
-        self.lock, self.free = threading.Lock(), []  # type: ignore[var-annotated]
-
-    def take(self) -> Any:
-        with self.lock:
-            return self.free.pop() if self.free else np.zeros(self.shape, self.dtype)
-
-    def give_back(self, array: Any) -> None:
-        with self.lock:
-            self.free.append(array)
 
 
 def _texels(planes: Tensor, valid: Tensor) -> Any:

@@ -10,9 +10,12 @@ import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
+import numpy as np
 import torch
+
+BLOCKS = 16  # of an image's rows, for any number of threads: the order in which derivatives are added up
 
 Result = TypeVar("Result")
 
@@ -107,3 +110,25 @@ def run_blocks(count: int, work: Callable[[int], Result], hand_over: Callable[[R
     for error in errors:
         if error is not None:
             raise error
+
+
+def row_blocks(batch: int, height: int) -> list[tuple[int, int, int]]:
+    """Image, first row and end of every block of a batch of images."""
+    rows = -(-height // BLOCKS)
+    return [(image, first, min(first + rows, height)) for image in range(batch) for first in range(0, height, rows)]
+
+
+class Spare:
+    """Arrays of zeros, used again."""
+
+    def __init__(self, shape: tuple[int, ...], dtype: Any) -> None:
+        self.shape, self.dtype = shape, dtype
+        self.lock, self.free = threading.Lock(), []  # type: ignore[var-annotated]
+
+    def take(self) -> Any:
+        with self.lock:
+            return self.free.pop() if self.free else np.zeros(self.shape, self.dtype)
+
+    def give_back(self, array: Any) -> None:
+        with self.lock:
+            self.free.append(array)
