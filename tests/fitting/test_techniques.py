@@ -48,7 +48,7 @@ def test_all_used_parameters_are_fitted_and_what_is_off_stays_off(
     for name in set(kind.PARAMETERS) - set(fitted):
         assert result.values.get(name) == start.values().get(name)  # None, 0 or without use
     again = fitting.fit(result.module, gbuffer, target, max_evaluations=10, scan=False)
-    assert again.rmse <= result.rmse * (1 + 1e-9)
+    assert again.rmse <= result.rmse * (1 + 1e-9) + 1e-7  # rounding
     assert torch.isfinite(result.module(gbuffer)).all()
 
 

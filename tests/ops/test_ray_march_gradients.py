@@ -100,7 +100,7 @@ def test_surrogate_keeps_the_value_and_moves_the_thickness() -> None:
     assert slopes["thickness"] == 0
     assert min(abs(slopes[name]) for name in ("radius", "falloff", "contrast")) > 1e-2
     value, slopes = parameter_gradients(gb, gradient="surrogate")
-    assert torch.equal(value, exact)
+    torch.testing.assert_close(value, exact, rtol=0, atol=1e-12)  # exact may run as compiled loops
     assert min(map(abs, slopes.values())) > 1e-2
     soft, _ = parameter_gradients(gb, gradient="soft", surrogate_width=1e-4)
     assert (soft - exact).abs().median() < 1e-3  # the soft form tends to the hard one
