@@ -110,11 +110,16 @@ def test_an_interrupt_that_a_library_swallows_is_not_lost(
         return quick_fit(*arguments, **options)
 
     monkeypatch.setattr(chain, "fit", swallowing)
-    before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt, match=f"after {0 if disguise else 1} of 3 candidates"):
-        run(tmp_path)
-    assert len(list(tmp_path.iterdir())) == (0 if disguise else 1)
-    assert signal.getsignal(signal.SIGINT) is before
+    inherited = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # shells start background jobs with SIGINT ignored
+    try:
+        with pytest.raises(KeyboardInterrupt, match=f"after {0 if disguise else 1} of 3 candidates"):
+            run(tmp_path)
+        assert len(list(tmp_path.iterdir())) == (0 if disguise else 1)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, inherited)
 
 
 def test_an_interruption_without_a_folder_says_that_nothing_is_kept(counter: Counter) -> None:
