@@ -113,8 +113,8 @@ def taps() -> list[Row]:
     return rows
 
 
-def gradients(step: float = 0.05, frames: int = 32) -> list[Row]:
-    """R d mean / dR of the gradient, and of differences over the same frames with the same relative step."""
+def gradients(step: float = 0.07, frames: int = 32) -> list[Row]:
+    """R d mean / dR of the gradient, and of differences over the same frames; not over the step that is differenced inside."""
     gb, rows, radius = clutter(48, 64).to(torch.float64), [], 0.6
     modules: dict[str, tuple[type, dict[str, Any]]] = {}
     for weighting in ("cosine", "uniform"):

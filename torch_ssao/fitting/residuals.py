@@ -105,10 +105,8 @@ class Residuals:
 
     def value(self, log: Tensor) -> Tensor:
         """(M,) float64 residuals at the (P,) logarithms. One evaluation. Raises: BudgetSpent."""
-        self._spend(1)
-        with torch.no_grad():
-            parts = [self._predict(view, log)[view.inside].double() - view.wanted for view in self._active]
-        return self._seen(log, torch.cat(parts))
+        self.spend(1)
+        return self._seen(log, self._differences(log))
 
     def value_at_best_contrast(self, log: Tensor) -> Tensor:
         """Like `value`, but with the contrast that suits this image best; returns the (P,) logarithms with it.
@@ -116,13 +114,11 @@ class Residuals:
         Contrast is the last thing every technique does (visibility^contrast), so that trying another one costs a power and
         no evaluation. One evaluation; without a contrast that all scenes share the same as `value`. Raises: BudgetSpent.
         """
-        self._spend(1)
-        with torch.no_grad():
-            parts = [self._predict(view, log)[view.inside].double() for view in self._active]
-        image, wanted = torch.cat(parts), torch.cat([view.wanted for view in self._active])
+        self.spend(1)
+        difference = self._differences(log)
+        self._seen(log, difference)
         at = self.space.column("contrast")
         if at is None:
-            self._seen(log, image - wanted)
             return log
 
         def moved(step: float) -> Tensor:
@@ -130,8 +126,8 @@ class Residuals:
             changed[at] += step
             return changed
 
-        self._seen(log, image - wanted)
-        image = image.clamp(0, 1)
+        wanted = torch.cat([view.wanted for view in self._active])
+        image = (difference + wanted).clamp(0, 1)
         low, high = -CONTRAST_REACH, CONTRAST_REACH
         for _ in range(CONTRAST_ROUNDS):  # a narrowing grid: the error is smooth in contrast and has one minimum
             tried = torch.linspace(low, high, 9, dtype=torch.float64).tolist()
@@ -147,7 +143,7 @@ class Residuals:
 
         Forward mode with the tangents as a vmapped batch: the primal is computed once for all columns, one view at a time.
         """
-        self._spend(len(self.space))
+        self.spend(len(self.space))
         rows = []
         with torch.no_grad():
             for view in self._active:
@@ -179,6 +175,11 @@ class Residuals:
         state = {f"raw_{name}": raw for name, raw in self.space.of_scene(view.scene, log).items()}
         return torch.func.functional_call(self.modules[view.scene], state, (view.gbuffer,))
 
+    def _differences(self, log: Tensor) -> Tensor:
+        """(N,) float64 prediction - target over the views in use."""
+        with torch.no_grad():
+            return torch.cat([self._predict(view, log)[view.inside].double() - view.wanted for view in self._active])
+
     def _predict(self, view: View, log: Tensor) -> Tensor:
         return self.predict(view, log.to(view.gbuffer.depth.device))[0, 0]
 
@@ -199,16 +200,11 @@ class Residuals:
 
     def move_to(self, log: Tensor) -> None:
         """Make `log` the best point, whatever the squares say. Not counted."""
-        with torch.no_grad():
-            parts = [self._predict(view, log)[view.inside].double() - view.wanted for view in self.views]
-        self.best_log, self.best_difference = log.clone(), torch.cat(parts)
+        self.best_log, self.best_difference = log.clone(), self._differences(log)
         self.best = self._residual(self.best_difference, log)
 
     def spend(self, count: float) -> None:
-        """Count evaluations done elsewhere. Raises: BudgetSpent."""
-        self._spend(count)
-
-    def _spend(self, count: float) -> None:
+        """Count evaluations. Raises: BudgetSpent."""
         cost = count * self._share
         if self._spent + cost > self.budget + 1e-9:
             raise BudgetSpent

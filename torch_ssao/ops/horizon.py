@@ -142,7 +142,7 @@ def _compiled(kernel: _Horizon) -> Kernel:
     """The loops beside a kernel; numba is imported here, on first use."""
     from torch_ssao.ops._numba.horizon import HorizonLoops
 
-    return HorizonLoops(kernel, *kernel[:7])
+    return HorizonLoops(kernel)
 
 
 def _usable(normal: Tensor, valid: Tensor) -> Tensor:

@@ -113,7 +113,7 @@ def _compiled(kernel: _March) -> Kernel:
     """The loops beside a kernel; numba is imported here, on first use."""
     from torch_ssao.ops._numba.ray_march import MarchLoops
 
-    return MarchLoops(kernel, *kernel[:5])
+    return MarchLoops(kernel)
 
 
 def tangent_planes(points: Tensor, normal: Tensor, valid: Tensor, intrinsics: Tensor, *, orthographic: bool) -> Tensor:

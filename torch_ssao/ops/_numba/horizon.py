@@ -12,27 +12,19 @@ from torch import Tensor
 
 from torch_ssao.ops._numba import horizon_rows as rows
 from torch_ssao.ops._numba import taps, taps_back
+from torch_ssao.ops._numba.arrays import as_array, as_pyramid, wanted
 from torch_ssao.ops._numba.pool import Spare, row_blocks, run_blocks
-from torch_ssao.ops.depth_pyramid import build_pyramid
-from torch_ssao.ops.horizon_taps import Layout
-from torch_ssao.ops.recompute import Kernel, Outputs
+from torch_ssao.ops.recompute import Outputs
 
 
 class HorizonLoops(NamedTuple):
     """See `recompute.Kernel`. Forward mode is the torch kernel's."""
 
-    torch_kernel: Kernel
-    layout: Layout
-    cosine: bool
-    estimator: str
-    connected: bool
-    rotation: Tensor
-    offset: Tensor
-    footprint_step: float
+    torch_kernel: Any  # `ops.horizon._Horizon`: a Kernel, and what was asked
     name: str = "horizon_obscurance"
 
     def value(self, *tensors: Tensor | None) -> Outputs:
-        images = _Images(self, tensors)
+        images = _Images(self.torch_kernel, tensors)
         out = np.empty(images.shape, images.dtype)
 
         def work(number: int) -> None:
@@ -45,8 +37,8 @@ class HorizonLoops(NamedTuple):
     def pull_back(
         self, grad: Tensor, needed: Sequence[bool], outputs: Outputs, *tensors: Tensor | None
     ) -> list[Tensor]:
-        images = _Images(self, tensors)
-        cotangent = _array(grad[:, 0])
+        images = _Images(self.torch_kernel, tensors)
+        cotangent = as_array(grad[:, 0])
         batch, height, width = images.shape
         to_texels = np.zeros((batch, 3 * height * width), images.dtype)
         to_normal = np.empty((batch, 3, height, width), images.dtype)
@@ -58,7 +50,7 @@ class HorizonLoops(NamedTuple):
             part, numbers, reached = spare.take(), np.zeros(8), np.zeros(2, np.int32)
             rows.rows_pull_back(
                 cotangent[image], part, reached, to_normal[image], numbers, *images.question(image),
-                self.footprint_step, first, last,
+                self.torch_kernel.footprint_step, first, last,
             )  # fmt: skip
             return image, part, numbers, reached
 
@@ -73,7 +65,7 @@ class HorizonLoops(NamedTuple):
         return self._found(planes, torch.from_numpy(to_normal), torch.from_numpy(to_numbers), needed, tensors)
 
     def push_forward(self, tangents: Sequence[Tensor | None], outputs: Outputs, *tensors: Tensor | None) -> Tensor:
-        return self.torch_kernel.push_forward(tangents, outputs, *tensors)
+        return self.torch_kernel.push_forward(tangents, outputs, *tensors)  # type: ignore[no-any-return]
 
     @staticmethod
     def _found(
@@ -82,27 +74,26 @@ class HorizonLoops(NamedTuple):
         numbers = numbers.to(planes.dtype)
         scalars = [numbers[:, i] for i in (taps_back.R, taps_back.FALLOFF, taps_back.THICKNESS, taps_back.BIAS)]
         everything = [planes, None, normal, numbers[:, :4], *scalars]
-        triples = zip(everything, needed, tensors, strict=True)
-        return [found for found, want, tensor in triples if want and tensor is not None and found is not None]
+        return wanted(everything, needed, tensors)
 
 
 class _Images:
     """The tensors of a question as arrays, and how its images fall into blocks of rows."""
 
-    def __init__(self, kernel: HorizonLoops, tensors: Sequence[Tensor | None]) -> None:
+    def __init__(self, kernel: Any, tensors: Sequence[Tensor | None]) -> None:
         planes, valid, normal, intrinsics, radius, falloff, thickness, bias = tensors
         self.shape = tuple(valid.shape)  # type: ignore[union-attr]
         batch, height, _ = self.shape
         self.kernel, layout = kernel, kernel.layout
         self.texels = _texels(planes, valid)  # type: ignore[arg-type]
         self.dtype = self.texels.dtype
-        self.normal = _array(normal)  # type: ignore[arg-type]
-        self.noise = _array(kernel.rotation), _array(kernel.offset)
+        self.normal = as_array(normal)  # type: ignore[arg-type]
+        self.noise = as_array(kernel.rotation), as_array(kernel.offset)
         longest = np.inf if layout.longest_px is None else layout.longest_px
         numbers = np.empty((batch, taps.IMAGE_NUMBERS), self.dtype)
-        numbers[:, :4] = _array(intrinsics)  # type: ignore[arg-type]
+        numbers[:, :4] = as_array(intrinsics)  # type: ignore[arg-type]
         for place, given in enumerate((radius, falloff, thickness, bias)):
-            numbers[:, taps.R + place] = np.inf if given is None else _array(given)
+            numbers[:, taps.R + place] = np.inf if given is None else as_array(given)
         numbers[:, taps.LONGEST_PX] = longest
         numbers[:, taps.BIAS_COSINE], numbers[:, taps.BIAS_SINE] = (f(numbers[:, taps.BIAS]) for f in (np.cos, np.sin))
         self.numbers = numbers
@@ -113,10 +104,7 @@ class _Images:
              kernel.estimator == "increments", connected, layout.max_radius_px is not None],
             dtype=np.int64,
         )  # fmt: skip
-        self.pyramid = np.zeros(1, np.int64), np.zeros(1, np.int64), 1.0
-        if layout.max_radius_px is not None:
-            pyramid = build_pyramid(valid, layout.max_radius_px)  # type: ignore[arg-type]
-            self.pyramid = _array(pyramid.pixel), _array(pyramid.start), float(pyramid.cap)
+        self.pyramid = as_pyramid(valid, layout.max_radius_px)  # type: ignore[arg-type]
         self.blocks = row_blocks(batch, height)
 
     def question(self, image: int) -> tuple[Any, ...]:
@@ -136,10 +124,6 @@ def _texels(planes: Tensor, valid: Tensor) -> Any:
     texels[..., :3] = torch.where(valid[:, None], planes, 0.0).permute(0, 2, 3, 1)
     texels[..., 3] = planes[:, 0]
     return texels.view(batch, -1).numpy()
-
-
-def _array(tensor: Tensor) -> Any:
-    return tensor.detach().contiguous().numpy()
 
 
 @lru_cache(maxsize=64)
