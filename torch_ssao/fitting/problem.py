@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from torch_ssao import checks
+from torch_ssao.fitting.views import SceneImages, check_scenes
 from torch_ssao.gbuffer import GBuffer
 from torch_ssao.modules import AmbientVisibility
 
@@ -228,21 +229,14 @@ def _sights(
     gbuffer: Any, target: Any, weights: Any, valid: Any, kind: str = "view"
 ) -> tuple[tuple[Sight, ...], tuple[str, ...]]:
     """Every view with a pixel that counts, and a note for each other."""
-    if isinstance(gbuffer, GBuffer):
-        scenes, tags = [(gbuffer, target, weights, valid)], [""]
-    else:
-        buffers = _as_many("gbuffer", gbuffer, None)
-        given = {"target": target, "weights": weights, "valid": valid}
-        rest = (_as_many(name, items, len(buffers)) for name, items in given.items())
-        scenes = list(zip(buffers, *rest, strict=True))
-        tags = [f"[{index}]" for index in range(len(buffers))]
     found: list[Sight] = []
     empty: list[str] = []
     number = 0
-    for scene, (arguments, tag) in enumerate(zip(scenes, tags, strict=True)):
-        for sight in _of_scene(scene, number, kind, tag, *arguments):
+    for place, scene in enumerate(check_scenes(gbuffer, target, weights, valid)):
+        for index in range(len(scene.gbuffer)):
+            sight = _sight(scene, index, place, number, f"{kind} {number}")
             if bool((sight.share > 0).any()):
-                _check_finite(sight)
+                replace(scene, tag="").check_finite(index, sight.label)  # views are numbered through
                 found.append(sight)
             else:
                 empty.append(sight.label)
@@ -255,62 +249,17 @@ def _sights(
     return tuple(found), tuple(f"{label} has no valid pixel and was left out." for label in empty)
 
 
-def _as_many(name: str, items: Any, count: int | None) -> list[Any]:
-    if items is None and count is not None and name != "target":
-        return [None] * count
-    if not isinstance(items, Sequence) or not items or (count is not None and len(items) != count):
-        wanted = "a GBuffer or a sequence of them" if count is None else f"a sequence of {count}, one per G-buffer"
-        got = f"{len(items)}" if isinstance(items, Sequence) else type(items).__name__
-        raise checks.ShapeError(f"{name} must be {wanted}, got {got}: pass a list")
-    return list(items)
+def _sight(scene: SceneImages, index: int, place: int, number: int, label: str) -> Sight:
+    def cut(image: Tensor | None) -> Tensor | None:
+        return None if image is None else image[index : index + 1]
 
-
-def _of_scene(
-    scene: int, first: int, kind: str, tag: str, gbuffer: Any, target: Any, weights: Any, valid: Any
-) -> list[Sight]:
-    """All views of one G-buffer."""
-    if not isinstance(gbuffer, GBuffer):
-        raise checks.ChoiceError(
-            f"gbuffer{tag} must be a GBuffer, got {type(gbuffer).__name__}: render or wrap the depth first"
-        )
-    device = gbuffer.depth.device
-    shape = (len(gbuffer), 1, *gbuffer.depth.shape[2:])
-    image, noise = getattr(target, "visibility", target), getattr(target, "standard_error", None)
-    checks.check_floating(f"target{tag}", image)
-    images = {"target": image, "standard_error": noise, "weights": weights, "valid": valid}
-    for name, tensor in images.items():
-        if tensor is not None:
-            checks.check_shape(f"{name}{tag}", tensor, shape, "one image per view of gbuffer")
-            images[name] = tensor.detach().to(device)
-    share = gbuffer.valid_mask[:, :1].double()
-    if valid is not None:
-        share = share * images["valid"].bool()
-    if weights is not None:
-        if not bool(torch.isfinite(weights).all()) or bool((weights < 0).any()):
-            raise checks.RangeError(f"weights{tag} must be finite and at least 0, got values that are not: clamp them")
-        share = share * images["weights"].double()
-
-    def cut(name: str, index: int) -> Any:
-        return None if images[name] is None else images[name][index : index + 1]
-
-    return [
-        Sight(
-            label=f"{kind} {first + index}",
-            number=first + index,
-            scene=scene,
-            gbuffer=gbuffer[index],
-            target=Target(cut("target", index), cut("standard_error", index)),
-            weights=cut("weights", index),
-            valid=cut("valid", index),
-            share=share[index : index + 1],
-        )
-        for index in range(len(gbuffer))
-    ]
-
-
-def _check_finite(sight: Sight) -> None:
-    bad = int((~torch.isfinite(sight.target.visibility) & (sight.share > 0)).sum())
-    if bad:
-        raise checks.RangeError(
-            f"target must be finite where it counts, got {bad} pixels of {sight.label} that are not: mask them with valid"
-        )
+    return Sight(
+        label=label,
+        number=number,
+        scene=place,
+        gbuffer=scene.gbuffer[index],
+        target=Target(scene.visibility[index : index + 1], cut(scene.standard_error)),
+        weights=cut(scene.weights),
+        valid=cut(scene.valid),
+        share=scene.share[index : index + 1],
+    )
