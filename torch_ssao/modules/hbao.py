@@ -47,7 +47,7 @@ class HBAO(AmbientVisibility):
         offscreen: "open" - what is off the image never occludes; "extend" - the surfaces at the border go on as planes.
         denoise: passes of the edge-aware filter.
         half_resolution: compute the pixels of even rows and columns only and carry them to the others along surfaces
-            (`ops.upsample`): about a quarter of the time; what is thinner than two pixels may be missed.
+            (`ops.upsample`): a third to two thirds of the time; what is thinner than two pixels may be missed.
         learnable: names of the parameters to register as `nn.Parameter`s, or "all"; the rest are buffers.
     Raises:
         RangeError, ChoiceError.

@@ -40,7 +40,7 @@ class RayMarchedSSAO(AmbientVisibility):
             None: every step reads its own pixel.
         denoise: passes of `ops.denoise.denoise_visibility`, before the contrast.
         half_resolution: compute the pixels of even rows and columns only and carry them to the others along surfaces
-            (`ops.upsample`): about a quarter of the time; what is thinner than two pixels may be missed.
+            (`ops.upsample`): a third to two thirds of the time; what is thinner than two pixels may be missed.
         learnable: names of the parameters to register as `nn.Parameter`s, or "all"; the rest are buffers.
     Raises:
         RangeError, ChoiceError.

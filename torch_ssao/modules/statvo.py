@@ -36,7 +36,7 @@ class StatVO(AmbientVisibility):
         inner_radius: radius of the second window, of the radius, > 0. Its box is as many times smaller in all directions.
         inner_weight: weight of the second window over that of the first, > 0.
         half_resolution: compute the pixels of even rows and columns only and carry them to the others along surfaces
-            (`ops.upsample`): about a quarter of the time; what is thinner than two pixels may be missed.
+            (`ops.upsample`): a third to two thirds of the time; what is thinner than two pixels may be missed.
         learnable: names of the parameters to register as `nn.Parameter`s, or "all"; the rest are buffers.
     Raises:
         RangeError, ChoiceError.
